@@ -1,0 +1,1 @@
+"""After the flight: stills, video, positions and control become a block."""

@@ -1,0 +1,1 @@
+"""Tables, figures and the page that tells how good a survey is."""

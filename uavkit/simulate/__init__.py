@@ -1,0 +1,1 @@
+"""Surveys of known truth; no stage imports this package."""
