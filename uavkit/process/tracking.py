@@ -1,0 +1,583 @@
+"""Tracking points through the video between two stills by orientation code matching.
+
+Each picture is matched against the patches of the *first* one, warped by the accumulated local transformation, so that
+errors do not add up; a patch is renewed only when its match decays. Positions are predicted from the motion
+so far. LMedS and the vote of the neighbours decide which matches hold, for on relief one affine
+transformation is not the truth (Anai et al. 2012, figure 7).
+"""
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from uavkit.core.arrays import Array, Flags
+from uavkit.core.errors import AdjustmentError, InputError
+from uavkit.process.affine_motion import (
+    apply_affine,
+    compose,
+    fit_affine,
+    fit_affine_robustly,
+    nearest_similarity,
+    similarity_power,
+)
+from uavkit.process.kernels.affine import local_warps, neighbour_votes
+from uavkit.process.orientation_code import (
+    Dissimilarity,
+    MatchPlan,
+    PointMatches,
+    coding_threshold,
+    match_codes_at,
+    packed_codes,
+)
+
+Grey = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimedPicture:
+    """A square-pixel luminance picture of the video with its time."""
+
+    image: Grey
+    time_s: float
+    usable: bool = True
+    """False where the caller knows that the picture is black, frozen or flashed."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackingOptions:
+    """Lengths are pixels of the pictures that are tracked."""
+
+    window_px: int = 21
+    search_radius_px: int = 3
+    lost_radius_px: int = 8
+    """Half width of the search for points, and for pictures, that were not found at their prediction."""
+    step_px: float = 4.0
+    """Pictures are left out until the points are predicted to have moved this far."""
+    most_step_s: float = 0.2
+    most_dissimilarity: float = 2.9
+    """In codes; 4 is chance."""
+    most_ambiguity: float = 0.92
+    renewal_dissimilarity: float = 2.2
+    """A template that matches worse than this three times running is cut anew from the last picture."""
+    least_share: float = 0.3
+    """A picture in which fewer of the visible points are found is taken for unusable."""
+    neighbours: int = 12
+    most_misses: int = 12
+    """Pictures running in which a point may go unseen before it is given up."""
+    variant: Dissimilarity = Dissimilarity.PAPER
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Motion:
+    """How the whole picture moved in the last step: for prediction, within an interval and into the next one."""
+
+    after_from_before: Array
+    """Similarity transformation (2, 3)."""
+    duration_s: float
+
+    def over(self, seconds: float) -> Array:
+        """The same motion continued for a time, (2, 3)."""
+        return similarity_power(self.after_from_before, seconds / self.duration_s)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackingResult:
+    """Where the points are in the last usable picture."""
+
+    points_px: Array
+    """(n, 2); of lost points the prediction."""
+    alive: Flags
+    """Found in the last usable picture, (n,)."""
+    dissimilarity: Array
+    """In codes, (n,); nan if never found."""
+    ambiguity: Array
+    """Best over second best dissimilarity, (n,)."""
+    affine: Array
+    """Last picture from first picture, (2, 3), fitted to all points that were found."""
+    warps: Array
+    """Local last_from_first about each point, (n, 2, 2)."""
+    motion: Motion | None
+    """Of the last step; None if no second picture was usable."""
+    time_s: float
+    """Of the last usable picture."""
+    pictures_used: int
+    gaps: int
+    """Pictures that were unusable."""
+
+
+def predict(result: TrackingResult, time_s: float) -> Array:
+    """Positions (n, 2) at a time near the end of tracking: the still's exposure, when the video may show nothing."""
+    if result.motion is None:
+        return result.points_px
+    return apply_affine(result.motion.over(time_s - result.time_s), result.points_px)
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A picture from which templates are cut."""
+
+    image: Grey
+    threshold: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackState:
+    """Everything known after a picture; advance() makes the next one."""
+
+    options: TrackingOptions
+    neighbours: NDArray[np.int64]
+    start_px: Array
+    sources: tuple[Source, ...]
+    source_of: NDArray[np.int64]
+    """Which source the template of each point is cut from, (n,)."""
+    source_px: Array
+    """Where in it, (n, 2)."""
+    source_warps: Array
+    """source_from_start about each point, (n, 2, 2)."""
+    points_px: Array
+    warps: Array
+    """current_from_start, (n, 2, 2)."""
+    drift_px_s: Array
+    """Motion of each point against the motion of all, (n, 2)."""
+    misses: NDArray[np.int64]
+    decayed: NDArray[np.int64]
+    """Running count of matches worse than renewal_dissimilarity, (n,)."""
+    dissimilarity: Array
+    ambiguity: Array
+    affine: Array
+    motion: Motion | None
+    time_s: float
+    last_image: Grey
+    pictures_used: int = 1
+    gaps: int = 0
+    blind_pictures: int = 0
+    """Unusable pictures since the last usable one."""
+    recent: deque[Grey] = field(default_factory=lambda: deque(maxlen=2))
+    """Small copies of the last pictures, to recognise a frozen one."""
+
+
+def start(
+    picture: TimedPicture, points_px: Array, options: TrackingOptions | None = None, motion: Motion | None = None
+) -> TrackState:
+    """Begin with points (n, 2) of a first picture; motion, of an earlier interval, predicts the first step."""
+    chosen = options or TrackingOptions()
+    points = np.array(points_px, np.float64)
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 6:
+        raise InputError(f"tracking needs at least 6 points (n, 2), got {points.shape}")
+    count = len(points)
+    unit = np.tile(np.eye(2), (count, 1, 1))
+    return TrackState(
+        options=chosen,
+        neighbours=_neighbours(points, chosen.neighbours),
+        start_px=points,
+        sources=(Source(picture.image, coding_threshold(picture.image)),),
+        source_of=np.zeros(count, np.int64),
+        source_px=points.copy(),
+        source_warps=unit,
+        points_px=points.copy(),
+        warps=unit.copy(),
+        drift_px_s=np.zeros((count, 2)),
+        misses=np.zeros(count, np.int64),
+        decayed=np.zeros(count, np.int64),
+        dissimilarity=np.full(count, np.nan),
+        ambiguity=np.full(count, np.nan),
+        affine=np.eye(2, 3),
+        motion=motion,
+        time_s=picture.time_s,
+        last_image=picture.image,
+        recent=deque([_small(picture.image)], maxlen=2),
+    )
+
+
+def _neighbours(points_px: Array, number: int) -> NDArray[np.int64]:
+    """Rows of the nearest other points, (n, number), -1 where there are fewer."""
+    wanted = min(number + 1, len(points_px))
+    _, rows = cKDTree(points_px).query(points_px, k=wanted)
+    result = np.full((len(points_px), number), -1, np.int64)
+    result[:, : wanted - 1] = rows[:, 1:]
+    return result
+
+
+def _small(image: Grey) -> Grey:
+    return np.ascontiguousarray(image[::4, ::4])
+
+
+def is_usable(state: TrackState, picture: TimedPicture) -> bool:
+    """False for a picture that is flagged, black, blown out, or the same as one of the last two in spite of motion."""
+    if not picture.usable:
+        return False
+    small = _small(picture.image)
+    if small.std() < 3.0 or (small > 250).mean() > 0.4:
+        return False
+    if predicted_step_px(state, picture.time_s) < 1.0:
+        return True
+    return all(float(cv2.norm(small, old, cv2.NORM_L1)) / small.size > 0.3 for old in state.recent)
+
+
+def predicted_step_px(state: TrackState, time_s: float) -> float:
+    """How far the fastest tenth of the points should have moved since the last picture; infinite while unknown."""
+    if state.motion is None:
+        return float("inf")
+    step = apply_affine(state.motion.over(time_s - state.time_s), state.points_px) - state.points_px
+    return float(np.quantile(np.hypot(step[:, 0], step[:, 1]), 0.9))
+
+
+def advance(state: TrackState, picture: TimedPicture, rng: np.random.Generator) -> TrackState:
+    """Follow the points into a later picture; a picture that cannot be used only counts as a gap."""
+    if picture.image.shape != state.last_image.shape:
+        raise InputError(f"picture size changed from {state.last_image.shape} to {picture.image.shape}")
+    if not is_usable(state, picture):
+        return _blind(state)
+    packed = packed_codes(picture.image)
+    for motion, radius in _attempts(state, picture):
+        found = _follow(state, packed, motion, picture.time_s, radius, rng)
+        if found is not None:
+            return _moved(state, picture, found)
+    return _blind(state)
+
+
+def _blind(state: TrackState) -> TrackState:
+    return replace(state, gaps=state.gaps + 1, blind_pictures=state.blind_pictures + 1)
+
+
+def _attempts(state: TrackState, picture: TimedPicture) -> Iterable[tuple[Array, int]]:
+    """Predicted transformations with the search radius that fits: the usual one, a wider one, a global search."""
+    options = state.options
+    known = state.motion is not None
+    motion = state.motion.over(picture.time_s - state.time_s) if state.motion is not None else np.eye(2, 3)
+    usual = min(options.lost_radius_px, options.search_radius_px + state.blind_pictures // 2)
+    if known:
+        yield motion, usual
+    if not known or usual < options.lost_radius_px:
+        yield motion, options.lost_radius_px
+    yield coarse_motion(state.last_image, picture.image, motion), options.lost_radius_px
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Found:
+    """Matches of one picture that hold, and where the other points should be."""
+
+    matches: PointMatches
+    good: Flags
+    points_px: Array
+    step: Array
+    residuals_px: Array
+
+
+def _follow(
+    state: TrackState, packed: Grey, motion: Array, time_s: float, radius: int, rng: np.random.Generator
+) -> _Found | None:
+    """Match all points about their prediction; None if too few are found for this to be the same scene."""
+    options = state.options
+    seconds = time_s - state.time_s
+    predicted = apply_affine(motion, state.points_px) + state.drift_px_s * seconds
+    tried = state.misses <= options.most_misses
+    radii = np.where(tried, np.where(state.misses > 0, min(2 * radius, options.lost_radius_px), radius), 0)
+    matches = _match(state, packed, predicted, motion, radii)
+    good = _credible(matches, options)
+    visible = matches.coded_share >= 0
+    visible &= ~np.isnan(matches.points_px[:, 0])
+    if good.sum() < max(6, options.least_share * visible.sum()):
+        return None
+    fresh = good & (state.misses == 0)
+    fit_rows = fresh if fresh.sum() >= 6 else good
+    try:
+        step = fit_affine_robustly(state.points_px[fit_rows], matches.points_px[fit_rows], rng)
+    except AdjustmentError:
+        return None
+    if step.inliers.sum() < max(6, 0.5 * options.least_share * visible.sum()):
+        return None
+    return _voted(state, matches, good, step.target_from_source, step.scale_px)
+
+
+def _match(state: TrackState, packed: Grey, predicted: Array, motion: Array, radii: NDArray[np.int64]) -> PointMatches:
+    """Match with templates cut from each source and warped by source_from_start (motion current_from_start)^-1."""
+    warps = motion[:, :2] @ state.warps
+    source_from_current = state.source_warps @ np.linalg.inv(warps)
+    parts = []
+    for index, source in enumerate(state.sources):
+        rows = np.flatnonzero(state.source_of == index)
+        plan = MatchPlan(
+            reference_px=state.source_px[rows],
+            predicted_px=predicted[rows],
+            reference_from_target=source_from_current[rows],
+            radii_px=radii[rows],
+        )
+        options = state.options
+        parts.append(
+            (
+                rows,
+                match_codes_at(
+                    source.image,
+                    packed,
+                    plan,
+                    threshold=source.threshold,
+                    window_px=options.window_px,
+                    variant=options.variant,
+                ),
+            )
+        )
+    return _joined(parts, len(predicted))
+
+
+def _joined(parts: list[tuple[NDArray[np.int64], PointMatches]], count: int) -> PointMatches:
+    points, dissimilarity, ambiguity = np.full((count, 2), np.nan), np.full(count, np.nan), np.full(count, np.nan)
+    on_rim, coded = np.zeros(count, np.bool_), np.full(count, -1.0)
+    for rows, part in parts:
+        points[rows], dissimilarity[rows], ambiguity[rows] = part.points_px, part.dissimilarity, part.ambiguity
+        on_rim[rows], coded[rows] = part.on_rim, part.coded_share
+    return PointMatches(
+        points_px=points, dissimilarity=dissimilarity, ambiguity=ambiguity, on_rim=on_rim, coded_share=coded
+    )
+
+
+def _credible(matches: PointMatches, options: TrackingOptions) -> Flags:
+    """Matches that are good by themselves; unmatched points are nan and compare as False."""
+    good = (matches.dissimilarity <= options.most_dissimilarity) & ~matches.on_rim
+    return np.asarray(good & ~(matches.ambiguity > options.most_ambiguity))
+
+
+def _voted(state: TrackState, matches: PointMatches, good: Flags, step: Array, scale_px: float) -> _Found:
+    """Keep matches whose residual against the affine step agrees with that of their neighbours (or, alone, is small).
+
+    A point that was lost has no previous position to step from: for it the whole displacement since the start is
+    compared with the neighbours', with the width of the search as its tolerance.
+    """
+    expected = apply_affine(step, state.points_px)
+    residuals = matches.points_px - expected
+    fresh = good & (state.misses == 0)
+    medians, spread, votes = _votes(residuals, fresh, state.neighbours)
+    tolerance = np.minimum(np.maximum(2.5 * spread, 0.75), np.maximum(2.5 * scale_px, 1.5))
+    against_neighbours = np.abs(residuals - medians).max(axis=1)
+    against_all = np.abs(residuals).max(axis=1)
+    holds = np.where(votes >= 5, against_neighbours <= tolerance, against_all <= 2.5 * scale_px)
+    holds_again = against_neighbours <= state.options.lost_radius_px / 2 + tolerance
+    kept = good & np.where(state.misses == 0, holds, holds_again)
+    points = np.where(kept[:, None], matches.points_px, expected + medians)
+    return _Found(
+        matches=matches,
+        good=kept,
+        points_px=points,
+        step=step,
+        residuals_px=np.where(kept[:, None], residuals, medians),
+    )
+
+
+def _votes(residuals: Array, counted: Flags, neighbours: NDArray[np.int64]) -> tuple[Array, Array, NDArray[np.int64]]:
+    count = len(residuals)
+    medians, spread, votes = np.empty((count, 2)), np.empty(count), np.empty(count, np.int64)
+    neighbour_votes(residuals, counted, neighbours, medians, spread, votes)
+    return medians, spread, votes
+
+
+def _moved(state: TrackState, picture: TimedPicture, found: _Found) -> TrackState:
+    """The state after a picture in which the points were found."""
+    good, points = found.good, found.points_px
+    seconds = picture.time_s - state.time_s
+    affine = (
+        _trimmed_affine(state.start_px[good], points[good]) if good.sum() >= 6 else compose(found.step, state.affine)
+    )
+    warps = np.empty_like(state.warps)
+    general = np.ascontiguousarray(affine[:, :2])
+    local_warps(state.start_px, points, good, state.neighbours, general, np.array([0.15, 0.4]), warps)
+    similarity = nearest_similarity(found.step, points[good])
+    extra = apply_affine(found.step, state.points_px) - apply_affine(similarity, state.points_px)
+    state.recent.append(_small(picture.image))
+    worse = found.matches.dissimilarity > state.options.renewal_dissimilarity
+    moved = replace(
+        state,
+        points_px=points,
+        warps=warps,
+        drift_px_s=0.5 * state.drift_px_s + 0.5 * (found.residuals_px + extra) / seconds,
+        misses=np.where(good, 0, state.misses + 1),
+        decayed=np.where(good & worse, state.decayed + 1, np.where(good, 0, state.decayed)),
+        dissimilarity=np.where(good, found.matches.dissimilarity, state.dissimilarity),
+        ambiguity=np.where(good, found.matches.ambiguity, state.ambiguity),
+        affine=affine,
+        motion=Motion(after_from_before=similarity, duration_s=seconds),
+        time_s=picture.time_s,
+        last_image=picture.image,
+        pictures_used=state.pictures_used + 1,
+        blind_pictures=0,
+    )
+    return _renewed(moved, good)
+
+
+def _trimmed_affine(start_px: Array, current_px: Array) -> Array:
+    """Least squares affine of all, once more without the worst tenth."""
+    affine = fit_affine(start_px, current_px)
+    residuals = np.abs(current_px - apply_affine(affine, start_px)).max(axis=1)
+    kept = residuals <= np.quantile(residuals, 0.9)
+    return fit_affine(start_px[kept], current_px[kept]) if kept.sum() >= 6 else affine
+
+
+def _renewed(state: TrackState, good: Flags) -> TrackState:
+    """Cut templates anew where three matches running have decayed; sources that nobody uses any more are dropped."""
+    renew = good & (state.decayed >= 3)
+    if renew.sum() < 1:
+        return state
+    newest = Source(state.last_image, coding_threshold(state.last_image))
+    source_of = np.where(renew, len(state.sources), state.source_of)
+    used = np.unique(source_of)
+    sources = (*state.sources, newest)
+    return replace(
+        state,
+        sources=tuple(sources[index] for index in used),
+        source_of=np.searchsorted(used, source_of),
+        source_px=np.where(renew[:, None], state.points_px, state.source_px),
+        source_warps=np.where(renew[:, None, None], state.warps, state.source_warps),
+        decayed=np.where(renew, 0, state.decayed),
+    )
+
+
+_COARSE = 4
+_COARSE_ANGLES_DEG = (0.0, -5.0, 5.0, -10.0, 10.0, -15.0, 15.0, -20.0, 20.0, -25.0, 25.0)
+_FINE_ANGLES_DEG = (0.0, -2.5, 2.5, -1.25, 1.25)
+
+
+def coarse_motion(before: Grey, after: Grey, predicted: Array) -> Array:
+    """after_from_before (2, 3) near a predicted one by phase correlation of pictures at a quarter of the size.
+
+    Turns the earlier picture by angles about the prediction and takes the shift of the highest peak.
+    """
+    size = (before.shape[1] // _COARSE, before.shape[0] // _COARSE)
+    small_before = cv2.resize(before, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    small_after = cv2.resize(after, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    best = _best_turn(small_before, small_after, predicted, _COARSE_ANGLES_DEG)
+    return _best_turn(small_before, small_after, best, _FINE_ANGLES_DEG)
+
+
+def _best_turn(
+    before: NDArray[np.float32], after: NDArray[np.float32], predicted: Array, angles_deg: tuple[float, ...]
+) -> Array:
+    """The best of several turns about the middle of the picture; transformations are in full-size pixels."""
+    rows, columns = after.shape
+    window = cv2.createHanningWindow((columns, rows), cv2.CV_32F)
+    middle = (np.array([columns, rows]) * _COARSE - 1) / 2
+    best, best_response = predicted, -1.0
+    for angle_deg in angles_deg:
+        c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+        turn = np.array([[c, -s], [s, c]])
+        tried = compose(np.column_stack([turn, middle - turn @ middle]), predicted)
+        # full-size pixel x is small pixel (x - (k - 1) / 2) / k
+        half = (_COARSE - 1) / 2
+        shift = (tried[:, :2] @ np.full(2, half) + tried[:, 2] - half) / _COARSE
+        mean = float(before.mean())
+        warped = cv2.warpAffine(before, np.column_stack([tried[:, :2], shift]), (columns, rows), borderValue=mean)
+        (dx, dy), response = cv2.phaseCorrelate(warped, after, window)
+        if response > best_response:
+            best_response = response
+            best = tried + np.array([[0, 0, dx * _COARSE], [0, 0, dy * _COARSE]])
+    return best
+
+
+def track(
+    pictures: Iterable[TimedPicture],
+    points_px: Array,
+    options: TrackingOptions | None = None,
+    *,
+    rng: np.random.Generator,
+    initial_affine: Array | None = None,
+    motion: Motion | None = None,
+) -> TrackingResult:
+    """Follow points (n, 2) from the first usable picture through all others.
+
+    initial_affine (2, 3) brings points_px into the first usable picture, where they were measured at another instant
+    (the still's); motion is that of the interval before. Pictures are left out as long as little motion is
+    predicted; the last usable one is always matched. Raises InputError if there is no usable picture.
+    """
+    points = points_px if initial_affine is None else apply_affine(initial_affine, points_px)
+    state: TrackState | None = None
+    waiting: TimedPicture | None = None
+    for picture in pictures:
+        if state is None:
+            if picture.usable and _small(picture.image).std() >= 3.0:
+                state = start(picture, points, options, motion)
+            continue
+        if _may_wait(state, picture):
+            waiting = picture
+            continue
+        before = state
+        state = advance(state, picture, rng)
+        if state.time_s == before.time_s and waiting is not None:
+            # this picture was no use: the one left out last is nearer to it than any other
+            state = advance(state, waiting, rng)
+        waiting = None
+    if state is None:
+        raise InputError("no usable picture to begin tracking with")
+    return _result(advance(state, waiting, rng) if waiting is not None else state)
+
+
+def _may_wait(state: TrackState, picture: TimedPicture) -> bool:
+    """True if a picture is worth matching only should it turn out to be the last one."""
+    soon = picture.time_s - state.time_s < state.options.most_step_s
+    return soon and predicted_step_px(state, picture.time_s) < state.options.step_px and is_usable(state, picture)
+
+
+def _result(state: TrackState) -> TrackingResult:
+    return TrackingResult(
+        points_px=state.points_px,
+        alive=np.asarray((state.misses == 0) & ~np.isnan(state.dissimilarity)),
+        dissimilarity=state.dissimilarity,
+        ambiguity=state.ambiguity,
+        affine=state.affine,
+        warps=state.warps,
+        motion=state.motion,
+        time_s=state.time_s,
+        pictures_used=state.pictures_used,
+        gaps=state.gaps,
+    )
+
+
+def square_field(field_lines: Grey, parity: int) -> Grey:
+    """Square pixels at frame size, (2 k, w), from the k lines of one field; parity 0: top field, 1: bottom field.
+
+    Line k of the top field is frame row 2 k, of the bottom field 2 k + 1; the result's pixel (column, row) is frame
+    pixel (column, row) for both. Rows between lines are interpolated with the cubic (-1 9 9 -1) / 16, the same for
+    both parities; rows beyond the outermost line repeat it.
+    """
+    _check_parity(field_lines, parity)
+    lines = np.pad(field_lines.astype(np.int32), ((2, 2), (0, 0)), mode="edge")
+    between = (9 * (lines[1:-2] + lines[2:-1]) - lines[:-3] - lines[3:] + 8) >> 4
+    between = np.clip(between, 0, 255)
+    result = np.empty((2 * field_lines.shape[0], field_lines.shape[1]), np.uint8)
+    result[parity::2] = field_lines
+    # between[k] lies above line k
+    result[1 - parity :: 2] = between[1:] if parity == 0 else between[:-1]
+    return result
+
+
+def square_field_half(field_lines: Grey, parity: int) -> Grey:
+    """Square pixels at half frame size, (k, w / 2), from the k lines of one field; parity 0: top, 1: bottom.
+
+    The result's pixel (c, r) is frame pixel (2 c + 0.5, 2 r + 0.5) for both parities: a row lies a quarter of a field
+    line below line r of the top field (3/4 line r, 1/4 line r + 1) and as much above that of the bottom field.
+    """
+    _check_parity(field_lines, parity)
+    lines = field_lines.astype(np.uint16)
+    pairs = lines[:, 0 : 2 * (lines.shape[1] // 2) : 2] + lines[:, 1::2]
+    padded = np.pad(pairs, ((1, 1), (0, 0)), mode="edge")
+    other = padded[2:] if parity == 0 else padded[:-2]
+    return ((3 * pairs + other + 4) >> 3).astype(np.uint8)
+
+
+def frame_from_half(points_half_px: Array) -> Array:
+    """Frame pixels (n, 2) of positions in a picture of square_field_half."""
+    return 2.0 * points_half_px + 0.5
+
+
+def half_from_frame(points_px: Array) -> Array:
+    """Positions (n, 2) in a picture of square_field_half of frame pixels."""
+    return (points_px - 0.5) / 2.0
+
+
+def _check_parity(field_lines: Grey, parity: int) -> None:
+    if parity not in (0, 1) or field_lines.ndim != 2 or field_lines.dtype != np.uint8:
+        raise InputError(
+            f"a field is 8-bit (lines, width) with parity 0 or 1, got {field_lines.dtype}, parity {parity}"
+        )
