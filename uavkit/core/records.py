@@ -56,6 +56,8 @@ class StillInfo:
     maker: str = ""
     model: str = ""
     focal_length_mm: float | None = None
+    focal_length_35mm: float | None = None
+    """The focal length of the same field of view on 36 mm x 24 mm film; makers round it to whole millimetres."""
     camera_time_ns: int | None = None
     """The camera's own clock read as if it were UTC, as GPS time; off and drifting, often whole seconds only."""
     camera_time_resolution_ns: int = 1_000_000_000
