@@ -25,9 +25,10 @@ def omega_phi_kappa_from_rotation(rotation: Array) -> tuple[float, float, float]
     r = np.asarray(rotation, dtype=np.float64)
     cos_phi = float(np.hypot(r[0, 0], r[0, 1]))
     phi = float(np.arctan2(r[0, 2], cos_phi))
-    if cos_phi < 1e-9:
-        return 0.0, phi, float(np.arctan2(r[1, 0], r[1, 1]))
-    return float(np.arctan2(-r[1, 2], r[2, 2])), phi, float(np.arctan2(-r[0, 1], r[0, 0]))
+    omega = 0.0 if cos_phi < 1e-12 else float(np.arctan2(-r[1, 2], r[2, 2]))
+    # Near +-90 degrees omega is uncertain; kappa from Rx(omega)^T R, not from the first row, makes up for its error.
+    second_row = np.cos(omega) * r[1] + np.sin(omega) * r[2]
+    return omega, phi, float(np.arctan2(second_row[0], second_row[1]))
 
 
 def skew(vector: Array) -> Array:
@@ -61,7 +62,8 @@ def vector_from_rotation(rotation: Array) -> Array:
     if cosine > 0.0:
         return axis_sin
     values, vectors = np.linalg.eigh(0.5 * (r + r.T))
-    return np.asarray(vectors[:, int(np.argmax(values))] * angle)
+    axis = vectors[:, int(np.argmax(values))]
+    return np.asarray(axis * (angle if axis @ axis_sin >= 0.0 else -angle))
 
 
 def nearest_rotation(matrix: Array) -> Array:

@@ -5,6 +5,7 @@ nothing; here that is an InputError.
 """
 
 import os
+import warnings
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 from pyproj.exceptions import CRSError, ProjError
+from pyproj.transformer import TransformerGroup
 
 from uavkit.core.angles import nearest_rotation
 from uavkit.core.arrays import Array
@@ -20,8 +22,8 @@ from uavkit.core.heights import HeightDatum
 
 GEOID_GRID = Path(__file__).resolve().parents[1] / "data" / "egm96_15.gtx"
 WGS84 = "EPSG:4979"
-WORST_TRANSFORMATION_M = 2.0
-"""Stated accuracy beyond which a datum transformation is refused; regional realisations of ITRF state 1 to 2 m."""
+WORST_TRANSFORMATION_M = 3.0
+"""Stated accuracy beyond which a datum transformation is refused; regional realisations of ITRF state 1 to 3 m."""
 
 os.environ["PROJ_NETWORK"] = "OFF"  # read by each context that PROJ makes: no grid is ever fetched
 
@@ -59,22 +61,46 @@ def utm_crs(latitude_deg: float, longitude_deg: float) -> str:
 @lru_cache(maxsize=16)
 def _transformer(source: str, target: str) -> pyproj.Transformer:
     crs_from, crs_to = parse_crs(source), parse_crs(target)
-    advice = "give the coordinates in a system on WGS 84, ITRF or a datum with published parameters"
     try:
         transformer = pyproj.Transformer.from_crs(
             crs_from, crs_to, always_xy=True, allow_ballpark=False, only_best=True
         )
     except ProjError as error:
-        raise InputError(
-            f"no exact transformation from {crs_from.name} to {crs_to.name} is available here (a grid is missing); "
-            f"{advice}"
-        ) from error
-    if transformer.accuracy > WORST_TRANSFORMATION_M:
-        raise InputError(
-            f"the transformation from {crs_from.name} to {crs_to.name} available here is good to "
-            f"{transformer.accuracy:g} m only (a grid is missing); {advice}"
-        )
+        raise _inexact(crs_from, crs_to) from error
+    if transformer.accuracy < 0 and not _best_is_available(crs_from, crs_to):
+        raise _inexact(crs_from, crs_to)
+    _refuse_inaccurate(transformer.accuracy, crs_from, crs_to)
     return transformer
+
+
+def _inexact(crs_from: pyproj.CRS, crs_to: pyproj.CRS, what: str = "no exact transformation") -> InputError:
+    return InputError(
+        f"{what} from {crs_from.name} to {crs_to.name} is available here (a grid is missing); give the coordinates in "
+        f"a system on WGS 84, ITRF or a datum with published parameters"
+    )
+
+
+def _refuse_inaccurate(accuracy_m: float, crs_from: pyproj.CRS, crs_to: pyproj.CRS) -> None:
+    if accuracy_m > WORST_TRANSFORMATION_M:
+        raise _inexact(crs_from, crs_to, f"only a transformation good to {accuracy_m:g} m")
+
+
+def _best_is_available(crs_from: pyproj.CRS, crs_to: pyproj.CRS) -> bool:
+    """Tell whether, of several transformations among which PROJ chooses point by point, none better lacks its grid."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # it says in words what best_available says
+        return bool(TransformerGroup(crs_from, crs_to, always_xy=True, allow_ballpark=False).best_available)
+
+
+def _transform(source: str, target: str, coordinates: Array) -> Array:
+    """Transform (n, 3) coordinates, x or longitude first; raises InputError where what PROJ chose is not accurate."""
+    transformer = _transformer(source, target)
+    x, y, height = coordinates.T
+    result = np.column_stack(transformer.transform(x, y, height, errcheck=True))
+    if transformer.accuracy < 0 and len(coordinates):
+        used = transformer.get_last_used_operation()
+        _refuse_inaccurate(used.accuracy, parse_crs(source), parse_crs(target))
+    return result
 
 
 @lru_cache(maxsize=1)
@@ -120,7 +146,8 @@ class LocalFrame:
     longitude_deg: float
     height_ellipsoid_m: float
     crs: str
-    """The horizontal CRS of the survey's files: EPSG code or PROJ text; heights beside it are ellipsoidal."""
+    """The horizontal CRS of the survey's files: EPSG code or PROJ text; heights beside it are above the ellipsoid of
+    WGS 84, whatever the ellipsoid of the CRS, unless the CRS has a height of its own."""
 
     def __post_init__(self) -> None:
         parse_crs(self.crs)
@@ -129,8 +156,8 @@ class LocalFrame:
     def _enu_from_geographic(self) -> pyproj.Transformer:
         return pyproj.Transformer.from_pipeline(
             f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
-            f"+step +proj=topocentric +ellps=WGS84 +lat_0={self.latitude_deg!r} +lon_0={self.longitude_deg!r} "
-            f"+h_0={self.height_ellipsoid_m!r}"
+            f"+step +proj=topocentric +ellps=WGS84 +lat_0={float(self.latitude_deg)!r} "
+            f"+lon_0={float(self.longitude_deg)!r} +h_0={float(self.height_ellipsoid_m)!r}"
         )
 
     def enu_from_geographic(self, latitude_deg: Array, longitude_deg: Array, height_ellipsoid_m: Array) -> Array:
@@ -156,9 +183,11 @@ class LocalFrame:
 
     def crs_from_enu(self, enu_m: Array) -> Array:
         """Return easting, northing and ellipsoidal height in the survey's CRS, shape (n, 3), of ENU (n, 3)."""
-        latitude, longitude, height = self.geographic_from_enu(enu_m).T
-        transformer = _transformer(WGS84, _three_dimensional(self.crs))
-        return np.column_stack(transformer.transform(longitude, latitude, height, errcheck=True))
+        geographic = self.geographic_from_enu(enu_m)
+        result = _transform(WGS84, _three_dimensional(self.crs), geographic[:, [1, 0, 2]])
+        if not _has_height(self.crs):
+            result[:, 2] = geographic[:, 2]
+        return result
 
     def R_crs_from_enu(self, enu_m: Array) -> Array:
         """Return the rotation (3, 3) from ENU axes to the axes of the CRS at a point (3,): meridian convergence and
@@ -178,27 +207,31 @@ class LocalFrame:
         )
 
 
+def _has_height(crs: str) -> bool:
+    return len(parse_crs(crs).axis_info) >= 3
+
+
 def _three_dimensional(crs: str) -> str:
     parsed = parse_crs(crs)
-    return parsed.to_wkt() if len(parsed.axis_info) >= 3 else parsed.to_3d().to_wkt()
+    return parsed.to_wkt() if _has_height(crs) else parsed.to_3d().to_wkt()
 
 
 def geographic_from_crs(coordinates_m: Array, crs: str) -> Array:
     """Return latitude, longitude (degrees) and ellipsoidal height (n, 3) of coordinates (n, 3) in a CRS.
 
-    The heights count from the ellipsoid (for a CRS with a vertical part: from that part's datum). Raises InputError
-    where a coordinate cannot be transformed, naming it.
+    The heights count from the ellipsoid of WGS 84, also where the CRS is on another ellipsoid (for a CRS with a
+    vertical part: from that part's datum). Raises InputError where a coordinate cannot be transformed, naming it.
     """
-    transformer = _transformer(_three_dimensional(crs), WGS84)
-    first, second, third = np.asarray(coordinates_m, dtype=np.float64).T
+    given = np.asarray(coordinates_m, dtype=np.float64)
+    source = _three_dimensional(crs)
     try:
-        longitude, latitude, height = transformer.transform(first, second, third, errcheck=True)
+        result = _transform(source, WGS84, given)
+        if not _has_height(crs):
+            own_height = given[:, 2] + (given[:, 2] - result[:, 2])
+            result = _transform(source, WGS84, np.column_stack([given[:, :2], own_height]))
     except ProjError as error:
         raise InputError(f"coordinates do not fit {crs}: {error}") from error
-    result = np.column_stack([latitude, longitude, height])
     bad = ~np.all(np.isfinite(result), axis=1)
     if np.any(bad):
-        raise InputError(
-            f"coordinates {coordinates_m[bad][0]} do not fit {crs}: wrong CRS, or easting and northing swapped"
-        )
-    return result
+        raise InputError(f"coordinates {given[bad][0]} do not fit {crs}: wrong CRS, or easting and northing swapped")
+    return result[:, [1, 0, 2]]

@@ -32,7 +32,7 @@ def gps_time_ns_from_utc(utc: datetime) -> int:
 def utc_from_gps_time_ns(gps_time_ns: int) -> datetime:
     """Return UTC, rounded down to microseconds; inside a leap second (23:59:60) the following second is returned."""
     atomic = GPS_EPOCH + timedelta(microseconds=gps_time_ns // 1000)
-    ahead = sum(atomic >= date + timedelta(seconds=count) for count, date in enumerate(LEAP_SECOND_DATES))
+    ahead = sum(atomic >= date + timedelta(seconds=count) for count, date in enumerate(LEAP_SECOND_DATES, start=1))
     return atomic - timedelta(seconds=ahead)
 
 

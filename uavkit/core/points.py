@@ -40,7 +40,7 @@ class SurveyedPoint:
     marks: tuple[ImageMark, ...]
 
     def __post_init__(self) -> None:
-        if min(self.sigma_m) <= 0:
+        if not all(sigma > 0 for sigma in self.sigma_m):
             raise ValueError(f"{self.name}: sigma_m must be > 0, is {self.sigma_m}")
 
 
