@@ -64,7 +64,8 @@ def test_a_surveyed_point_needs_sigmas(sigma_m: tuple[float, float, float]) -> N
 
 def test_control_and_check_points_are_not_the_same_thing() -> None:
     values: dict[str, Any] = {"name": "P7", "position_m": (1.0, 2.0, 3.0), "sigma_m": (0.01, 0.01, 0.02), "marks": ()}
-    assert ControlPoint(**values) != CheckPoint(**values)
+    control: object = ControlPoint(**values)
+    assert control != CheckPoint(**values)
 
 
 @pytest.mark.parametrize("sigma_px", [0.0, -0.5, float("nan")])
