@@ -1,8 +1,8 @@
 """Collinearity equations with all derivatives, one ray at a time (checked against ``core.collinearity``)."""
 
 import numpy as np
-
 from numpy.typing import NDArray
+
 from uavkit.process.kernels.jit import kernel
 
 Array = NDArray[np.float64]

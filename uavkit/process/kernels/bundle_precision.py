@@ -95,8 +95,8 @@ def point_precision(
 
 @kernel
 def _covariance_with_image(
-    rays: RayTable, inverse: Inverse, row: Indices, count: int, mixed: Array, mixed_border: Array, own: Array, image: int,
-    out: Array,
+    rays: RayTable, inverse: Inverse, row: Indices, count: int, mixed: Array, mixed_border: Array, own: Array,
+    image: int, out: Array,
 ) -> None:  # fmt: skip
     """Write the covariance (3, 6) between a point and the orientation of an image."""
     sums = np.zeros((3, 6))

@@ -1,0 +1,184 @@
+"""The bundle block adjustment: least squares of all observations of a block, robust, with the precision of its results.
+
+Method: Brown (1958, 1976); M-estimation by Tukey's biweight, a cut at ``reject_above``, and a last pass at the sigmas
+stated beforehand, from which sigma0 and all covariances come.
+"""
+
+from typing import TypeVar
+
+import numpy as np
+
+from uavkit.core.adjustment import AdjustmentInput, AdjustmentOptions, AdjustmentResult, Datum
+from uavkit.core.arrays import Array, Flags, Indices
+from uavkit.core.camera import INTERIOR_PARAMETERS
+from uavkit.core.errors import AdjustmentError
+from uavkit.core.progress import Progress, silent
+from uavkit.process.bundle_robust import (
+    REJECTION_ROUNDS,
+    RETURNING_ROUNDS,
+    cut_weights,
+    huber_start,
+    normalised,
+    same,
+    tukey_solution,
+    used_rays,
+)
+from uavkit.process.bundle_system import (
+    BundleSystem,
+    Precision,
+    State,
+    Weights,
+    build_system,
+    gauss_newton_step,
+    joint_covariance,
+    misclosures,
+    precision_at,
+)
+from uavkit.process.precision import group_sigma0, interior_covariance, total_redundancy, weighted_square_sum
+from uavkit.process.robust import cut_variance
+
+Values = TypeVar("Values", Array, Flags)
+UNDETERMINED_SHARE = 0.9
+
+
+def adjust_block(
+    observations: AdjustmentInput,
+    options: AdjustmentOptions | None = None,
+    *,
+    joint_points: Indices | None = None,
+    progress: Progress = silent,
+) -> AdjustmentResult:
+    """Adjust a block: see ``AdjustmentInput``, ``AdjustmentOptions`` and ``AdjustmentResult``.
+
+    Raises AdjustmentError where the observations do not determine the unknowns, saying which.
+    """
+    options = options or AdjustmentOptions()
+    datum = options.datum or choose_datum(observations)
+    check_input(observations, datum)
+    system = build_system(observations, datum, options.default_shift_sigma_m)
+    state, weights = system.start(), system.full_weights()
+    rounds = 0
+    if options.robust:
+        state, weights = huber_start(system, state)
+        state, weights = tukey_solution(system, state, weights, options, progress)
+        precision = precision_at(system, state, weights)
+        weights = cut_weights(system, normalised(system, state, weights, precision), weights, options, True)
+    while True:
+        state, iterations, converged = solve(system, state, weights, options)
+        precision = precision_at(system, state, weights)
+        rounds += 1
+        if not options.robust or rounds >= REJECTION_ROUNDS:
+            break
+        z = normalised(system, state, weights, precision)
+        next_weights = cut_weights(system, z, weights, options, rounds < RETURNING_ROUNDS)
+        if same(next_weights, weights):
+            break
+        weights = next_weights
+        progress("bundle block adjustment: rejection", rounds, REJECTION_ROUNDS)
+    return _result(system, state, weights, precision, _Run(options, iterations, converged, joint_points))
+
+
+def choose_datum(observations: AdjustmentInput) -> Datum:
+    """Return CONTROL with at least 3 control points (or 1 beside GNSS), else GNSS with 3 fixes, else FREE_NETWORK."""
+    control = 0 if observations.control is None else len(np.unique(observations.control.point_index))
+    fixes = 0 if observations.gnss is None else len(observations.gnss)
+    if control >= 3 or (control >= 1 and fixes >= 3):
+        return Datum.CONTROL
+    return Datum.GNSS if fixes >= 3 else Datum.FREE_NETWORK
+
+
+def check_input(observations: AdjustmentInput, datum: Datum) -> None:
+    """Raise AdjustmentError where images or the datum lack observations."""
+    rays, images = observations.rays, len(observations.projection_centres_m)
+    shared = np.bincount(rays.point_index, minlength=len(observations.points_m)) >= 2
+    if observations.control is not None and datum is not Datum.FREE_NETWORK:
+        shared[observations.control.point_index] = True
+    count = np.bincount(rays.image_index[shared[rays.point_index]], minlength=images)
+    poor = np.flatnonzero(count < 3)
+    if len(poor):
+        listed = ", ".join(f"image {i} ({count[i]})" for i in poor[:5])
+        raise AdjustmentError(
+            f"{len(poor)} image(s) have fewer than 3 rays to points that others see too: {listed}; leave them out"
+        )
+    if datum is Datum.CONTROL and (observations.control is None or len(observations.control) == 0):
+        raise AdjustmentError("the datum is to be fixed by control points, but there is none")
+    if datum is Datum.GNSS and (observations.gnss is None or len(observations.gnss) < 3):
+        raise AdjustmentError("the datum is to be fixed by GNSS, but there are fewer than 3 fixes")
+
+
+def solve(system: BundleSystem, state: State, weights: Weights, options: AdjustmentOptions) -> tuple[State, int, bool]:
+    """Iterate Gauss-Newton steps at fixed weights; return the state, the number of steps and whether it converged."""
+    damping = 0.0 if options.robust else 1e-4
+    for number in range(1, options.most_iterations + 1):
+        step = gauss_newton_step(system, state, weights, damping)
+        state, damping = step.state, step.damping
+        if step.size < options.convergence:
+            return state, number, True
+    return state, options.most_iterations, False
+
+
+class _Run:
+    """What the result tells of the run."""
+
+    __slots__ = ("converged", "iterations", "joint_points", "options")
+
+    def __init__(self, options: AdjustmentOptions, iterations: int, converged: bool, joint: Indices | None) -> None:
+        self.options, self.iterations, self.converged = options, iterations, converged
+        self.joint_points = np.zeros(0, dtype=np.int64) if joint is None else np.asarray(joint, dtype=np.int64)
+
+
+def _unsorted(system: BundleSystem, values: Values) -> Values:
+    """Return values of sorted rays in the order of the input."""
+    result = np.empty_like(values)
+    result[system.order] = values
+    return result
+
+
+def _result(system: BundleSystem, state: State, weights: Weights, precision: Precision, run: _Run) -> AdjustmentResult:
+    determined, given = precision.determined, system.given
+    used = used_rays(system, weights, determined)
+    points = np.where(determined[:, None], state.points, np.nan)
+    found = misclosures(system, state)
+    residuals = np.where(determined[system.point_of_ray][:, None], found.rays_px, np.nan)
+    square_sum, redundancy = (
+        weighted_square_sum(system, state, weights, determined),
+        total_redundancy(system, weights, determined),
+    )
+    if redundancy <= 0:
+        raise AdjustmentError(f"the block has no redundancy ({redundancy:.0f}): sigma0 cannot be told")
+    cut = cut_variance(run.options.reject_above) if run.options.robust else 1.0
+    interior = interior_covariance(system, precision)
+    sigmas, prior = np.sqrt(np.diag(interior)), given.interior_sigmas.values()
+    q, n = len(system.free), len(state.centres)
+    shift_covariance = precision.inverse.corner[q:, q:].reshape(len(state.shifts), 3, len(state.shifts), 3)
+    return AdjustmentResult(
+        interior=given.interior.with_parameters(state.interior),
+        interior_covariance=interior,
+        undetermined_interior=tuple(
+            name
+            for name, after, before in zip(INTERIOR_PARAMETERS, sigmas, prior, strict=True)
+            if before > 0 and after > UNDETERMINED_SHARE * before
+        ),
+        projection_centres_m=state.centres,
+        R_object_from_image=state.rotations,
+        exterior_covariances=precision.inverse.blocks[system.pattern.diagonal].reshape(n, 6, 6),
+        points_m=points,
+        point_covariances_m2=precision.point_covariances_m2,
+        ray_used=_unsorted(system, used),
+        ray_residuals_px=_unsorted(system, residuals),
+        ray_redundancy=_unsorted(system, np.where(used[:, None], 1.0 - precision.ray_leverage, np.nan)),
+        gnss_used=weights.gnss > 0.0,
+        gnss_residuals_m=found.gnss_m,
+        gnss_shift_m=state.shifts,
+        gnss_shift_covariance_m2=np.einsum("fafb->fab", shift_covariance),
+        control_used=weights.control > 0.0,
+        control_residuals_m=found.control_m,
+        sigma0=float(np.sqrt(square_sum / redundancy / cut)),
+        redundancy=redundancy,
+        group_sigma0=group_sigma0(system, state, weights, precision),
+        datum=system.datum,
+        iterations=run.iterations,
+        converged=run.converged,
+        joint_points=run.joint_points,
+        joint_covariance_m2=joint_covariance(system, state, weights, precision.factor, run.joint_points),
+    )

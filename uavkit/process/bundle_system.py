@@ -1,0 +1,520 @@
+"""The observation equations of a block: its unknowns, one Gauss-Newton step, and the precision at a solution."""
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+
+from uavkit.core.adjustment import AdjustmentInput, Datum
+from uavkit.core.angles import rotation_from_vector, skew
+from uavkit.core.arrays import Array, Flags, Indices
+from uavkit.core.errors import AdjustmentError
+from uavkit.process.kernels import bundle_normals as kernels
+from uavkit.process.kernels.bundle_normals import Coordinates, RayTable, Reduced, Unknowns
+from uavkit.process.kernels.bundle_precision import Inverse, point_precision
+from uavkit.process.normal_equations import (
+    Factoriser,
+    InnerDatum,
+    Pattern,
+    ReducedFactor,
+    empty_reduced,
+    factor_dense,
+    pattern_of_rays,
+)
+
+CHUNKS = 4
+"""Parts into which points are shared among threads, whatever the number of processors: sums keep their order."""
+SMALL = 2000
+"""Blocks of fewer rays are not worth a thread."""
+BEHIND_CAMERA = 1e3
+"""Misclosure, in sigma, that the cost counts for a ray whose point is behind its camera."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class State:
+    """Values of all unknowns."""
+
+    interior: Array
+    centres: Array
+    rotations: Array
+    points: Array
+    shifts: Array
+
+    @property
+    def unknowns(self) -> Unknowns:
+        """Return the part that kernels know."""
+        return Unknowns(self.interior, self.centres, self.rotations, self.points)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Weights:
+    """Robust weights, 0 to 1, of rays (k,), GNSS fixes (g,) and control points (c,)."""
+
+    rays: Array
+    gnss: Array
+    control: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Misclosures:
+    """Observed minus computed, in units of observation."""
+
+    rays_px: Array
+    gnss_m: Array
+    control_m: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BundleSystem:
+    """Observations of a block, sorted for the kernels."""
+
+    given: AdjustmentInput
+    datum: Datum
+    rays: RayTable
+    order: Indices
+    """(k,) row in the input of each sorted ray."""
+    point_of_ray: Indices
+    pattern: Pattern
+    free: Indices
+    """(q,) free parameters of the interior orientation."""
+    prior: Array
+    """(q,) their a priori values."""
+    prior_sigma: Array
+    shift_sigma_m: Array
+    """(flights, 3) a priori sigma; infinite where free."""
+    factorise: Factoriser = factor_dense
+
+    @property
+    def border(self) -> int:
+        """Return the number of border unknowns."""
+        return len(self.free) + self.shift_sigma_m.size
+
+    @property
+    def uses_gnss(self) -> bool:
+        """Tell whether GNSS fixes take part."""
+        return self.datum is not Datum.FREE_NETWORK and self.given.gnss is not None
+
+    @property
+    def uses_control(self) -> bool:
+        """Tell whether control points take part."""
+        return self.datum is not Datum.FREE_NETWORK and self.given.control is not None
+
+    def start(self) -> State:
+        """Return the approximate values."""
+        given = self.given
+        return State(
+            interior=given.interior.parameters(),
+            centres=np.array(given.projection_centres_m, dtype=np.float64),
+            rotations=np.array(given.R_object_from_image, dtype=np.float64),
+            points=np.array(given.points_m, dtype=np.float64),
+            shifts=np.zeros_like(self.shift_sigma_m),
+        )
+
+    def full_weights(self) -> Weights:
+        """Return weight 1 for every observation that takes part."""
+        gnss = len(self.given.gnss) if self.given.gnss is not None else 0
+        control = len(self.given.control) if self.given.control is not None else 0
+        return Weights(
+            rays=np.ones(len(self.order)),
+            gnss=np.full(gnss, float(self.uses_gnss)),
+            control=np.full(control, float(self.uses_control)),
+        )
+
+
+def build_system(
+    given: AdjustmentInput, datum: Datum, default_shift_sigma_m: tuple[float, float, float]
+) -> BundleSystem:
+    """Sort the observations of a block by points and images."""
+    rays, points, images = given.rays, len(given.points_m), len(given.projection_centres_m)
+    order = np.lexsort((rays.image_index, rays.point_index)).astype(np.int64)
+    point = rays.point_index[order].astype(np.int64)
+    start = np.searchsorted(point, np.arange(points + 1)).astype(np.int64)
+    image = rays.image_index[order].astype(np.int64)
+    sigmas = given.interior_sigmas.values()
+    free = np.flatnonzero(sigmas > 0.0).astype(np.int64)
+    return BundleSystem(
+        given=given,
+        datum=datum,
+        rays=RayTable(
+            start,
+            image,
+            np.ascontiguousarray(rays.xy_px[order], dtype=np.float64),
+            np.ascontiguousarray(rays.sigma_px[order], dtype=np.float64),
+        ),
+        order=order,
+        point_of_ray=point,
+        pattern=pattern_of_rays(image, start, images),
+        free=free,
+        prior=(given.interior_prior or given.interior).parameters()[free],
+        prior_sigma=sigmas[free],
+        shift_sigma_m=_shift_sigmas(given, datum, default_shift_sigma_m),
+    )
+
+
+def _shift_sigmas(given: AdjustmentInput, datum: Datum, default: tuple[float, float, float]) -> Array:
+    """Return the a priori sigmas of the GNSS shifts, (flights, 3): infinite where control frees them."""
+    if given.gnss is None or len(given.gnss) == 0 or datum is Datum.FREE_NETWORK:
+        return np.zeros((0, 3))
+    flights = int(np.max(given.gnss.flight)) + 1
+    stated = given.gnss.shift_sigma_m
+    if stated is None:
+        stated = (np.inf,) * 3 if datum is Datum.CONTROL else default
+    return np.tile(np.asarray(stated, dtype=np.float64), (flights, 1))
+
+
+def in_chunks(system: BundleSystem, work: Callable[[int, int], T]) -> Iterable[T]:
+    """Run work(first, last) over fixed ranges of points in threads; results come in the order of the points."""
+    start = system.rays.start
+    points, rays = len(start) - 1, int(start[-1])
+    if rays < SMALL:
+        return [work(0, points)]
+    bounds = [0, *(int(np.searchsorted(start, rays * part // CHUNKS)) for part in range(1, CHUNKS)), points]
+    with ThreadPoolExecutor(CHUNKS) as pool:
+        return list(pool.map(work, bounds[:-1], bounds[1:]))
+
+
+def misclosures(system: BundleSystem, state: State) -> Misclosures:
+    """Return observed minus computed of all observations (rays in sorted order; NaN behind the camera)."""
+    rays_px = np.empty_like(system.rays.xy_px)
+    list(in_chunks(system, lambda a, b: kernels.residuals(system.rays, state.unknowns, a, b, rays_px)))
+    return Misclosures(rays_px=rays_px, gnss_m=_gnss_misclosures(system, state), control_m=_control(system, state))
+
+
+def _gnss_misclosures(system: BundleSystem, state: State) -> Array:
+    gnss = system.given.gnss
+    if gnss is None:
+        return np.zeros((0, 3))
+    i = gnss.image_index
+    antenna = state.centres[i] + state.rotations[i] @ np.asarray(gnss.lever_arm_m)
+    shift = state.shifts[gnss.flight] if len(state.shifts) else 0.0
+    return np.asarray(gnss.position_m - antenna - shift)
+
+
+def _control(system: BundleSystem, state: State) -> Array:
+    control = system.given.control
+    if control is None:
+        return np.zeros((0, 3))
+    return np.asarray(control.position_m - state.points[control.point_index])
+
+
+def cost(system: BundleSystem, state: State, weights: Weights, determined: Flags) -> float:
+    """Return the weighted sum of squared misclosures, the a priori ones included."""
+    found = misclosures(system, state)
+    z = np.nan_to_num(found.rays_px / system.rays.sigma_px, nan=BEHIND_CAMERA)
+    total = float(np.sum((weights.rays * determined[system.point_of_ray])[:, None] * z * z))
+    if system.given.gnss is not None:
+        total += float(np.sum(weights.gnss[:, None] * (found.gnss_m / system.given.gnss.sigma_m) ** 2))
+    if system.given.control is not None:
+        total += float(np.sum(weights.control[:, None] * (found.control_m / system.given.control.sigma_m) ** 2))
+    total += float(np.sum(((state.interior[system.free] - system.prior) / system.prior_sigma) ** 2))
+    return total + float(np.sum((state.shifts / system.shift_sigma_m) ** 2))
+
+
+def control_coordinates(system: BundleSystem, state: State, weights: Weights) -> Coordinates:
+    """Return the normal equations of control points as observed object points."""
+    normal, right = np.zeros((len(state.points), 3, 3)), np.zeros((len(state.points), 3))
+    if system.given.control is not None:
+        control = system.given.control
+        p = weights.control[:, None] / control.sigma_m**2
+        np.add.at(right, control.point_index, p * _control(system, state))
+        np.add.at(normal, control.point_index, p[:, :, None] * np.eye(3))
+    return Coordinates(normal, right)
+
+
+def _add_gnss(system: BundleSystem, state: State, weights: Weights, reduced: Reduced) -> None:
+    """Add GNSS positions to the reduced normal equations."""
+    gnss = system.given.gnss
+    if gnss is None or not system.uses_gnss:
+        return
+    i, by_image = gnss.image_index, gnss_design(system, state)
+    p = weights.gnss[:, None] / gnss.sigma_m**2
+    misclosure = _gnss_misclosures(system, state)
+    weighted = by_image * p[:, :, None]
+    normal = np.einsum("gak,gam->gkm", weighted, by_image)
+    np.add.at(reduced.blocks, system.pattern.diagonal[i], normal)
+    np.add.at(reduced.diagonal_images, i, np.einsum("gkk->gk", normal))
+    np.add.at(reduced.right_images, i, np.einsum("gak,ga->gk", weighted, misclosure))
+    by_flight = reduced.border.transpose(0, 2, 1)
+    for axis in range(3):
+        column = len(system.free) + 3 * gnss.flight + axis
+        np.add.at(by_flight, (i, column), weighted[:, axis])
+        np.add.at(reduced.corner, (column, column), p[:, axis])
+        np.add.at(reduced.diagonal_border, column, p[:, axis])
+        np.add.at(reduced.right_border, column, p[:, axis] * misclosure[:, axis])
+
+
+def gnss_design(system: BundleSystem, state: State) -> Array:
+    """Return the derivatives (g, 3, 6) of antenna positions by centre and rotation: 1 and -R skew(lever arm)."""
+    gnss = system.given.gnss
+    assert gnss is not None
+    by_rotation = -state.rotations[gnss.image_index] @ skew(np.asarray(gnss.lever_arm_m))
+    return np.concatenate([np.broadcast_to(np.eye(3), by_rotation.shape), by_rotation], axis=2)
+
+
+def _add_priors(system: BundleSystem, state: State, reduced: Reduced) -> None:
+    """Add a priori observations of interior orientation and GNSS shifts."""
+    sigma = np.concatenate([system.prior_sigma, system.shift_sigma_m.ravel()])
+    value = np.concatenate([state.interior[system.free] - system.prior, state.shifts.ravel()])
+    reduced.corner[np.diag_indices_from(reduced.corner)] += sigma**-2.0
+    reduced.diagonal_border[:] += sigma**-2.0
+    reduced.right_border[:] -= value * sigma**-2.0
+
+
+def reduced_normals(system: BundleSystem, state: State, weights: Weights, damping: float) -> tuple[Reduced, Flags]:
+    """Return the reduced normal equations at a state, and which points (m,) their observations determine."""
+    coordinates = control_coordinates(system, state, weights)
+    determined = np.zeros(len(state.points), dtype=np.bool_)
+    q = len(system.free)
+
+    def work(first: int, last: int) -> Reduced:
+        part = empty_reduced(system.pattern, q)
+        kernels.accumulate(
+            system.rays, state.unknowns, weights.rays, system.free, coordinates, damping, first, last, part, determined
+        )
+        return part
+
+    total = empty_reduced(system.pattern, system.border)
+    for part in in_chunks(system, work):
+        for name in ("blocks", "right_images", "diagonal_images"):
+            getattr(total, name).__iadd__(getattr(part, name))
+        total.border[:, :, :q] += part.border
+        total.corner[:q, :q] += part.corner
+        total.right_border[:q] += part.right_border
+        total.diagonal_border[:q] += part.diagonal_border
+    _add_gnss(system, state, weights, total)
+    _add_priors(system, state, total)
+    return total, determined
+
+
+def inner_datum(system: BundleSystem, state: State) -> InnerDatum | None:
+    """Return the seven inner constraints of a free network over the exterior orientations, or None where not needed.
+
+    Shifts, rotations and scale about the mean centre; rotations count at the mean distance to the points, as lengths.
+    """
+    if system.datum is not Datum.FREE_NETWORK:
+        return None
+    n = len(state.centres)
+    local = state.centres - np.mean(state.centres, axis=0)
+    space = np.zeros((6 * n + system.border, 7))
+    images = space[: 6 * n].reshape(n, 6, 7)
+    images[:, :3, :3] = np.eye(3)
+    images[:, :3, 3:6] = -skew(local)
+    images[:, 3:, 3:6] = state.rotations.transpose(0, 2, 1)
+    images[:, :3, 6] = local
+    distance_m = float(np.median(np.linalg.norm(state.points - np.mean(state.centres, axis=0), axis=1)))
+    weight = np.zeros(len(space))
+    weight[: 6 * n] = np.tile([1.0, 1.0, 1.0, distance_m**2, distance_m**2, distance_m**2], n)
+    _, triangle = np.linalg.qr(np.sqrt(weight)[:, None] * space)
+    return InnerDatum(null_space=np.asarray(np.linalg.solve(triangle.T, space.T).T), weight=weight)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """A Gauss-Newton step."""
+
+    state: State
+    damping: float
+    """For the next step."""
+    size: float
+    """sqrt(step . right-hand side): no unknown changes by more than this many of its own sigmas."""
+    determined: Flags
+
+
+def gauss_newton_step(system: BundleSystem, state: State, weights: Weights, damping: float) -> Step:
+    """Return the state after one step that does not increase the weighted sum of squares (Levenberg 1944).
+
+    Raises AdjustmentError where the observations do not determine the unknowns.
+    """
+    datum = inner_datum(system, state)
+    while True:
+        reduced, determined = reduced_normals(system, state, weights, damping)
+        before = cost(system, state, weights, determined)
+        factor = system.factorise(reduced, damping, datum)
+        candidate, product = _apply(system, state, weights, damping, (reduced, factor))
+        after = cost(system, candidate, weights, determined)
+        if after <= before * (1.0 + 1e-12) + 1e-9:
+            size = float(np.sqrt(max(product, 0.0)))
+            return Step(
+                state=candidate, damping=damping / 10.0 if damping > 1e-9 else 0.0, size=size, determined=determined
+            )
+        damping = max(damping * 10.0, 1e-6)
+        if damping > 1e6:
+            raise AdjustmentError("the adjustment does not converge: no step lessens the sum of squared residuals")
+
+
+def _apply(
+    system: BundleSystem, state: State, weights: Weights, damping: float, equations: tuple[Reduced, ReducedFactor]
+) -> tuple[State, float]:
+    """Return the state moved by the solution, and step . right-hand side."""
+    reduced, factor = equations
+    full_right = np.concatenate([reduced.right_images.ravel(), reduced.right_border])
+    step = factor.solve(full_right)
+    n, q = len(state.centres), len(system.free)
+    images, border = np.ascontiguousarray(step[: 6 * n].reshape(n, 6)), np.ascontiguousarray(step[6 * n :])
+    coordinates, points = control_coordinates(system, state, weights), np.zeros_like(state.points)
+
+    def work(first: int, last: int) -> float:
+        return kernels.back_substitute(
+            system.rays,
+            state.unknowns,
+            weights.rays,
+            system.free,
+            coordinates,
+            damping,
+            first,
+            last,
+            images,
+            border,
+            points,
+        )
+
+    # Eliminated points took gradient' N_pp^-1 gradient with them; it comes back with their own steps.
+    product = float(sum(in_chunks(system, work))) + _direct_product(system, state, weights, images, border)
+    interior = state.interior.copy()
+    interior[system.free] += border[:q]
+    moved = State(
+        interior=interior,
+        centres=state.centres + images[:, :3],
+        rotations=state.rotations @ rotation_from_vector(images[:, 3:]),
+        points=state.points + points,
+        shifts=state.shifts + border[q:].reshape(-1, 3),
+    )
+    return moved, product
+
+
+def _direct_product(system: BundleSystem, state: State, weights: Weights, images: Array, border: Array) -> float:
+    """Return the part of step . right-hand side that GNSS and a priori observations make."""
+    q = len(system.free)
+    sigma = np.concatenate([system.prior_sigma, system.shift_sigma_m.ravel()])
+    value = np.concatenate([state.interior[system.free] - system.prior, state.shifts.ravel()])
+    total = -float(np.sum(border * value * sigma**-2.0))
+    if system.uses_gnss and system.given.gnss is not None:
+        gnss = system.given.gnss
+        moved = np.einsum("gak,gk->ga", gnss_design(system, state), images[gnss.image_index])
+        moved += border[q:].reshape(-1, 3)[gnss.flight]
+        p = weights.gnss[:, None] / gnss.sigma_m**2
+        total += float(np.sum(p * moved * _gnss_misclosures(system, state)))
+    return total
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Precision:
+    """Covariances and leverages (variance of the adjusted observation over its a priori variance) at a solution."""
+
+    factor: ReducedFactor
+    inverse: Inverse
+    determined: Flags
+    point_covariances_m2: Array
+    ray_leverage: Array
+    """(k, 2), sorted order; also of rays of weight 0; NaN where the point is not determined."""
+    gnss_leverage: Array
+    control_leverage: Array
+
+
+def precision_at(system: BundleSystem, state: State, weights: Weights) -> Precision:
+    """Return the precision of all unknowns at a state, for the sigmas stated a priori."""
+    reduced, determined = reduced_normals(system, state, weights, 0.0)
+    factor = system.factorise(reduced, 0.0, inner_datum(system, state))
+    inverse = factor.inverse()
+    coordinates = control_coordinates(system, state, weights)
+    covariances, leverage = np.empty((len(state.points), 3, 3)), np.empty((len(system.order), 2))
+
+    def work(first: int, last: int) -> None:
+        point_precision(
+            system.rays,
+            state.unknowns,
+            weights.rays,
+            system.free,
+            coordinates,
+            first,
+            last,
+            inverse,
+            covariances,
+            leverage,
+        )
+
+    list(in_chunks(system, work))
+    return Precision(
+        factor=factor,
+        inverse=inverse,
+        determined=determined,
+        point_covariances_m2=covariances,
+        ray_leverage=leverage,
+        gnss_leverage=_gnss_leverage(system, state, inverse),
+        control_leverage=_control_leverage(system, covariances),
+    )
+
+
+def _gnss_leverage(system: BundleSystem, state: State, inverse: Inverse) -> Array:
+    gnss = system.given.gnss
+    if gnss is None or not system.uses_gnss:
+        return np.zeros((0 if gnss is None else len(gnss), 3))
+    i, design = gnss.image_index, gnss_design(system, state)
+    blocks = inverse.blocks[system.pattern.diagonal[i]]
+    variance = np.einsum("gak,gkm,gam->ga", design, blocks, design)
+    for axis in range(3):
+        column = len(system.free) + 3 * gnss.flight + axis
+        variance[:, axis] += 2.0 * np.einsum("gk,gk->g", design[:, axis], inverse.border[i, :, column])
+        variance[:, axis] += inverse.corner[column, column]
+    return np.asarray(variance / gnss.sigma_m**2)
+
+
+def _control_leverage(system: BundleSystem, covariances: Array) -> Array:
+    control = system.given.control
+    if control is None or not system.uses_control:
+        return np.zeros((0 if control is None else len(control), 3))
+    return np.asarray(np.einsum("caa->ca", covariances[control.point_index]) / control.sigma_m**2)
+
+
+def joint_covariance(
+    system: BundleSystem, state: State, weights: Weights, factor: ReducedFactor, points: Indices
+) -> Array:
+    """Return the (3 j, 3 j) covariance of object points together; NaN rows for points that are not determined.
+
+    C_ab = delta_ab N_a^-1 + N_a^-1 W_a' Q W_b N_b^-1, with W the mixed part of image and border against the point.
+    """
+    n, size = len(state.centres), 6 * len(state.centres) + system.border
+    coordinates = control_coordinates(system, state, weights)
+    mixed, own = np.zeros((size, 3 * len(points))), np.zeros((3 * len(points), 3 * len(points)))
+    for k, p in enumerate(points):
+        part, inverse = kernels_point_parts(system, state, weights, coordinates, int(p))
+        mixed[: 6 * n, 3 * k : 3 * k + 3] = part[: 6 * n]
+        mixed[6 * n : 6 * n + len(system.free), 3 * k : 3 * k + 3] = part[6 * n :]
+        own[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = inverse
+    carried = mixed @ np.nan_to_num(own)
+    result = own + carried.T @ factor.solve(carried)
+    lost = np.isnan(np.diag(own))
+    result[lost] = np.nan
+    result[:, lost] = np.nan
+    return np.asarray(0.5 * (result + result.T))
+
+
+def kernels_point_parts(
+    system: BundleSystem, state: State, weights: Weights, coordinates: Coordinates, point: int
+) -> tuple[Array, Array]:
+    """Return the mixed part (6 n + q, 3) and inverse normal matrix (3, 3; NaN if undetermined) of one point."""
+    n, q = len(state.centres), len(system.free)
+    most = max(int(system.rays.start[point + 1] - system.rays.start[point]), 1)
+    by_image, by_border, by_point = np.empty((most, 2, 6)), np.empty((most, 2, q)), np.empty((most, 2, 3))
+    misclosure, row = np.empty((most, 2)), np.empty(most, dtype=np.int64)
+    count = kernels.linearise_point(
+        system.rays, state.unknowns, weights.rays, system.free, point, by_image, by_border, by_point, misclosure, row
+    )
+    inverse, gradient = np.full((3, 3), np.nan), np.empty(3)
+    mixed = np.zeros((6 * n + q, 3))
+    if not kernels.eliminate_point(coordinates, point, 0.0, count, by_point, misclosure, inverse, gradient):
+        return mixed, np.full((3, 3), np.nan)
+    for a in range(count):
+        i = 6 * int(system.rays.image[row[a]])
+        mixed[i : i + 6] += by_image[a].T @ by_point[a]
+        mixed[6 * n :] += by_border[a].T @ by_point[a]
+    return mixed, inverse
+
+
+def with_points(state: State, points: Array) -> State:
+    """Return a state with other object points."""
+    return replace(state, points=points)
