@@ -280,7 +280,7 @@ def _flagged_order(frame: "av.VideoFrame") -> FieldOrder | None:
         width=frame.width,
         height=frame.height,
         format=frame.format,
-        time_base=frame.time_base,  # type: ignore[arg-type]
+        time_base=frame.time_base,
     )
     fields = graph.add("separatefields")
     sink = graph.add("buffersink")
@@ -289,7 +289,7 @@ def _flagged_order(frame: "av.VideoFrame") -> FieldOrder | None:
     try:
         graph.configure()
         graph.push(frame)
-        first = luminance(graph.pull())
+        first = luminance(graph.vpull())
     except FFmpegError:
         return None
     whole = luminance(frame)
