@@ -375,6 +375,11 @@ def _votes(residuals: Array, counted: Flags, neighbours: NDArray[np.int64]) -> t
     return medians, spread, votes
 
 
+_WARP_LIMITS = np.array([0.15, 0.4])
+"""Weight of the general transformation in a local one, and how far the elements of the two may be apart: on a slope of
+45 degrees the local scale changes by the base over the height, 0.4 between stills of 60 % overlap."""
+
+
 def _moved(state: TrackState, picture: TimedPicture, found: _Found) -> TrackState:
     """The state after a picture in which the points were found."""
     good, points = found.good, found.points_px
@@ -382,9 +387,11 @@ def _moved(state: TrackState, picture: TimedPicture, found: _Found) -> TrackStat
     affine = (
         _trimmed_affine(state.start_px[good], points[good]) if good.sum() >= 6 else compose(found.step, state.affine)
     )
-    warps = np.empty_like(state.warps)
+    warps, implied = np.empty_like(state.warps), points.copy()
     general = np.ascontiguousarray(affine[:, :2])
-    local_warps(state.start_px, points, good, state.neighbours, general, np.array([0.15, 0.4]), warps)
+    local_warps(state.start_px, points, good, state.neighbours, general, _WARP_LIMITS, warps, implied)
+    # a lost point waits where its neighbours imply it to be, however long it was outside the picture
+    points = np.where(good[:, None], points, implied)
     similarity = nearest_similarity(found.step, points[good])
     extra = apply_affine(found.step, state.points_px) - apply_affine(similarity, state.points_px)
     state.recent.append(_small(picture.image))
@@ -394,7 +401,7 @@ def _moved(state: TrackState, picture: TimedPicture, found: _Found) -> TrackStat
         points_px=points,
         warps=warps,
         drift_px_s=0.5 * state.drift_px_s + 0.5 * (found.residuals_px + extra) / seconds,
-        misses=np.where(good, 0, state.misses + 1),
+        misses=_missed(state, found.matches, good),
         decayed=np.where(good & worse, state.decayed + 1, np.where(good, 0, state.decayed)),
         dissimilarity=np.where(good, found.matches.dissimilarity, state.dissimilarity),
         ambiguity=np.where(good, found.matches.ambiguity, state.ambiguity),
@@ -406,6 +413,13 @@ def _moved(state: TrackState, picture: TimedPicture, found: _Found) -> TrackStat
         blind_pictures=0,
     )
     return _renewed(moved, good)
+
+
+def _missed(state: TrackState, matches: PointMatches, good: Flags) -> NDArray[np.int64]:
+    """Count of misses; a point outside the picture may come back, so it is never given up there."""
+    outside = np.isnan(matches.points_px[:, 0])
+    more = np.where(outside, np.minimum(state.misses + 1, state.options.most_misses), state.misses + 1)
+    return np.where(good, 0, more)
 
 
 def _trimmed_affine(start_px: Array, current_px: Array) -> Array:

@@ -102,10 +102,12 @@ def local_warps(
     general: NDArray[np.float64],
     limits: NDArray[np.float64],
     warps: NDArray[np.float64],
+    expected: NDArray[np.float64],
 ) -> None:
     """current_from_start (n, 2, 2) about each point, fitted to its counted neighbours and drawn towards general (2, 2).
 
-    limits = (weight of general as a share of the neighbours' scatter, largest departure from general).
+    limits = (weight of general as a share of the neighbours' scatter, largest departure from general). expected (n, 2)
+    gets the position that the neighbours imply for the point; it is left as it is with fewer than four of them.
     """
     normal = np.zeros((2, 2))
     mixed = np.zeros((2, 2))
@@ -143,3 +145,5 @@ def local_warps(
             v = (mixed[j, 1] * a - mixed[j, 0] * b) / determinant
             warps[row, j, 0] += min(max(u, -limits[1]), limits[1])
             warps[row, j, 1] += min(max(v, -limits[1]), limits[1])
+            from_mean = warps[row, j, 0] * (start[row, 0] - mean_s[0]) + warps[row, j, 1] * (start[row, 1] - mean_s[1])
+            expected[row, j] = mean_c[j] + from_mean
