@@ -89,3 +89,11 @@ def test_ground_of_points_on_one_line(result: OrientedBlock) -> None:
     ground = ground_surface(replace(result, adjustment=replace(result.adjustment, points_m=points)))
     assert ground.height_m.min() >= 1.0
     assert ground.height_m.max() <= 3.0
+
+
+def test_one_bad_point_does_not_move_the_ground(result: OrientedBlock) -> None:
+    points = result.adjustment.points_m.copy()
+    sound = ground_surface(result).height_m
+    points[150, 2] += 500.0
+    spoilt = ground_surface(replace(result, adjustment=replace(result.adjustment, points_m=points))).height_m
+    assert np.abs(spoilt - sound).max() < 8.0  # the neighbours' heights, on a bank of 10 m

@@ -16,6 +16,8 @@ from uavkit.report.measures import determined_points
 MOST_POINTS = 20_000
 """Points from which the surface is made; more change nothing that a figure can show."""
 
+NEAREST_POINTS = 5
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ground:
@@ -75,18 +77,14 @@ def ground_surface(result: OrientedBlock, cells: int = 100) -> Ground:
 
 
 def _interpolated(points_m: Array, east_m: Array, north_m: Array) -> Array:
-    from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
-    from scipy.spatial import QhullError
+    """Return the median height of the points nearest to each node: one bad point among them does no harm."""
+    from scipy.spatial import cKDTree
 
-    if len(points_m) < 4:
-        return np.full(east_m.shape, float(np.median(points_m[:, 2])) if len(points_m) else 0.0)
-    try:
-        height = np.asarray(LinearNDInterpolator(points_m[:, :2], points_m[:, 2])(east_m, north_m), dtype=np.float64)
-    except QhullError:  # all points on one line
-        height = np.full(east_m.shape, np.nan)
-    empty = ~np.isfinite(height)
-    height[empty] = NearestNDInterpolator(points_m[:, :2], points_m[:, 2])(east_m[empty], north_m[empty])
-    return height
+    if not len(points_m):
+        return np.zeros(east_m.shape)
+    near = min(NEAREST_POINTS, len(points_m))
+    _, rows = cKDTree(points_m[:, :2]).query(np.column_stack([east_m.ravel(), north_m.ravel()]), k=near)
+    return np.asarray(np.median(points_m[rows.reshape(-1, near), 2], axis=1).reshape(east_m.shape))
 
 
 def exteriors(result: OrientedBlock) -> Iterator[ExteriorOrientation]:

@@ -26,6 +26,12 @@ DPI = 160
 STYLE: dict[Any, Any] = {
     "font.family": ["DejaVu Sans"],
     "font.size": 9.0,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "xtick.color": GREY,
+    "ytick.color": GREY,
     "axes.titlesize": 9.5,
     "axes.titley": 1.0,
     "axes.labelsize": 9.0,

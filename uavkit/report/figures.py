@@ -2,11 +2,11 @@
 
 from collections.abc import Callable, Iterator
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap
+from matplotlib.colors import BoundaryNorm, ListedColormap
 
 from uavkit.core.arrays import Array, Indices
 from uavkit.core.result import OrientedBlock
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 MOST_FOOTPRINTS = 60
 """Above this, outlines of footprints would hide the ground."""
 MOST_NAMES = 30
+MOST_BARS = 40
 MOST_OVERLAP_WORK = 4_000_000
 """Projections (cells times stills) that the overlap map may cost."""
 
@@ -72,7 +73,7 @@ def plan_view(result: OrientedBlock, ground: Ground) -> Drawing:
     for line in _strip_lines(result):
         axes.plot(line[:, 0], line[:, 1], color=INK, lw=0.9, zorder=3)
     stations = result.adjustment.projection_centres_m
-    side = 18 if len(stations) <= 100 else 5
+    side = 18 if len(stations) <= 100 else 7
     axes.scatter(
         stations[:, 0], stations[:, 1], marker="s", s=side, color=RED, ec="white", lw=0.5, zorder=4, label="station"
     )
@@ -83,7 +84,8 @@ def plan_view(result: OrientedBlock, ground: Ground) -> Drawing:
     plain_axes(axes, f"East [{unit}]", f"North [{unit}]")
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, borderaxespad=0.2, handletextpad=0.3)
     outlines = ", outlines of the stills on the ground" if len(result.images) <= MOST_FOOTPRINTS else ""
-    caption = f"Stations (squares), strips (lines){outlines}, and object points coloured by height."
+    strips = ", strips (lines)" if np.any(result.strips >= 0) else ""
+    caption = f"Stations (squares){strips}{outlines}, and object points coloured by height."
     return Drawing(name="plan", title="Stations and points from above", caption=caption, figure=figure)
 
 
@@ -137,7 +139,8 @@ def oblique_view(result: OrientedBlock, ground: Ground) -> Drawing:
     """Draw stations, strips and points obliquely from the south-west."""
     unit = length_unit(result).whole
     figure = new_figure(4.1)
-    axes = figure.add_subplot(projection="3d", computed_zorder=False)
+    figure.set_layout_engine("none")  # it leaves much room empty around three-dimensional axes
+    axes: Any = figure.add_axes((0.0, -0.04, 0.94, 1.1), projection="3d", computed_zorder=False)
     west, east, south, north = extent_m(result)
     points = _drawn_points(result, 8000)
     low, high = _height_limits(points)
@@ -160,7 +163,7 @@ def oblique_view(result: OrientedBlock, ground: Ground) -> Drawing:
     top = float(stations[:, 2].max()) if len(stations) else high
     bottom = min(low, top)
     axes.set(xlim=(west, east), ylim=(south, north), zlim=(bottom, max(top, high)))
-    axes.set_box_aspect((east - west, north - south, max(top, high) - bottom), zoom=1.38)
+    axes.set_box_aspect((east - west, north - south, max(top, high) - bottom), zoom=1.22)
     axes.view_init(elev=28.0, azim=-62.0)
     axes.locator_params(axis="z", nbins=4)
     axes.locator_params(axis="y", nbins=5)
@@ -180,9 +183,8 @@ def overlap_map(result: OrientedBlock, ground: Ground) -> Drawing:
     figure = new_figure(float(np.clip(WIDTH_IN * 0.84 * (north - south) / (east - west), 2.4, 8.0)) + 0.5)
     axes = figure.add_subplot()
     bounds = _overlap_bounds(counts)
-    colours = LinearSegmentedColormap.from_list(
-        "overlap", ["#FFFFFF", "#D55E00", "#F0C27B", "#C6DBEF", "#5A9BD4", "#08306B"], N=len(bounds) - 1
-    )
+    blues = mpl.colormaps["Blues"](np.linspace(0.25, 1.0, len(bounds) - 4))
+    colours = ListedColormap(["#FFFFFF", RED, "#F0B26B", *blues])
     picture = axes.imshow(
         counts, origin="lower", extent=(west, east, south, north), cmap=colours, norm=BoundaryNorm(bounds, colours.N)
     )
@@ -220,19 +222,21 @@ def ray_count_histogram(result: OrientedBlock) -> Drawing:
     rays = rays_of_points(result)[determined_points(result)]
     if not len(rays):
         return Drawing(name=name, title=title, caption="", absent="No object point is determined.")
-    top = int(np.clip(np.percentile(rays, 99.5), 4, 40))
-    counts = np.bincount(np.minimum(rays, top), minlength=top + 1)[2:]
+    top = max(int(np.percentile(rays, 99.5)), 4)
+    width = -(-(top - 1) // MOST_BARS)
+    edges = np.arange(2, top + width + 1, width)
+    counts, _ = np.histogram(np.clip(rays, 2, edges[-1] - 1), np.append(edges[:-1], edges[-1]) - 0.5)
     figure = new_figure(2.6)
     axes = figure.add_subplot()
-    bars = axes.bar(np.arange(2, top + 1), counts, color=BLUE, width=0.8)
-    if top <= 16:
+    bars = axes.bar(edges[:-1] + 0.5 * (width - 1), counts, color=BLUE, width=0.8 * width)
+    if len(counts) <= 16:
         axes.bar_label(bars, fontsize=7.5, padding=1.5, color=INK)
     plain_axes(axes, "Rays used", "Points")
     axes.grid(False, axis="x")
+    axes.set_xlim(2 - 0.8 * width, edges[-1] - 0.2 * width)
     axes.locator_params(axis="x", integer=True)
-    more = int(np.sum(rays > top))
-    if more:
-        axes.set_xlabel(f"Rays used (last bar: {top} and more)")
+    if np.any(rays >= edges[-1]):
+        axes.set_xlabel(f"Rays used (last bar: {edges[-2]} and more)")
     caption = f"Number of used rays of each of the {len(rays)} determined points; mean {rays.mean():.1f}."
     return Drawing(name=name, title=title, caption=caption, figure=figure)
 

@@ -38,7 +38,7 @@ def code_picture(result: OrientedBlock) -> Drawing:
     if pictures is None:
         return Drawing(name=name, title=title, caption="", absent=NO_PICTURES)
     coded = np.asarray(code_colours()[np.minimum(pictures.codes, CODES)] * 255.0, dtype=np.uint8)
-    figure = new_figure(0.5 * WIDTH_IN * pictures.grey.shape[0] / pictures.grey.shape[1] + 0.35)
+    figure = new_figure(0.5 * WIDTH_IN * pictures.grey.shape[0] / pictures.grey.shape[1] + 0.25)
     left, right = figure.subplots(1, 2)
     left.imshow(pictures.grey, cmap="gray", vmin=0, vmax=255)
     right.imshow(coded, interpolation="nearest")
@@ -80,13 +80,14 @@ def matches_picture(result: OrientedBlock) -> Drawing:
     pictures = result.pictures
     if pictures is None:
         return Drawing(name=name, title=title, caption="", absent=NO_PICTURES)
-    figure = new_figure(0.5 * WIDTH_IN * pictures.grey.shape[0] / pictures.grey.shape[1] + 0.35)
+    figure = new_figure(0.5 * WIDTH_IN * pictures.grey.shape[0] / pictures.grey.shape[1] + 0.25)
     left, right = figure.subplots(1, 2)
     _still_with_points(left, pictures.grey, pictures.matches[:, :2], pictures.still)
     _still_with_points(right, pictures.next_grey, pictures.matches[:, 2:], pictures.next_still)
     # A regular choice of lines over the rows of the picture; all at once would hide it.
     order = np.argsort(pictures.matches[:, 1], kind="stable")
-    for row in order[:: max(len(order) // MOST_LINES, 1)]:
+    drawn = order[:: -(-len(order) // MOST_LINES) or 1]
+    for row in drawn:
         a_column, a_row, b_column, b_row = pictures.matches[row].tolist()
         a, b = (a_column, a_row), (b_column, b_row)
         line = ConnectionPatch(a, b, "data", "data", axesA=left, axesB=right, color=ORANGE, lw=0.5, alpha=0.8)
@@ -94,7 +95,7 @@ def matches_picture(result: OrientedBlock) -> Drawing:
         figure.add_artist(line)
     count = len(pictures.matches)
     caption = f"{count} points matched between {pictures.still} and {pictures.next_still}"
-    caption += f"; lines for {min(count, MOST_LINES)} or so of them." if count > MOST_LINES else "."
+    caption += f"; lines for {len(drawn)} of them." if count > len(drawn) else "."
     return Drawing(name=name, title=title, caption=caption, figure=figure)
 
 

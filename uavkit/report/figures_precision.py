@@ -41,6 +41,8 @@ from uavkit.report.measures import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+LEAST_ARROW_PX = 0.05
+"""Residuals below this are not enlarged to fill the figure."""
 LEAST_RAYS = 3
 """In a cell of the image, for its mean residual to be drawn."""
 
@@ -49,18 +51,27 @@ def residual_vectors(result: OrientedBlock) -> Drawing:
     """Draw the mean residual of all stills in cells of the image."""
     name, title = "image_residuals", "Mean residuals in the image"
     interior, used = result.adjustment.interior, result.adjustment.ray_used
-    middle, mean, noise = _pooled(result, cells=16)
+    # As fine as leaves some 25 rays to a cell.
+    cells = int(np.clip(np.sqrt(np.sum(used) / 25.0 * interior.width_px / interior.height_px), 4, 16))
+    middle, mean, noise = _pooled(result, cells)
     if not len(middle):
         return Drawing(name=name, title=title, caption="", absent="No rays to show residuals of.")
     figure = new_figure(WIDTH_IN * 0.88 * interior.height_px / interior.width_px + 0.6)
     axes = figure.add_subplot()
-    cell = interior.width_px / 16
-    arrow_px = reach(np.hypot(*mean.T), 0.95)
+    cell = interior.width_px / cells
+    arrow_px = reach(np.hypot(*mean.T), 0.95, least=LEAST_ARROW_PX)
     scale = arrow_px / (0.85 * cell)
     large = np.hypot(*mean.T) > 3.5 * noise
     for mask, colour in ((~large, BLUE), (large, RED)):
         axes.quiver(
-            *middle[mask].T, *mean[mask].T, angles="xy", scale_units="xy", scale=scale, color=colour, width=0.003
+            *middle[mask].T,
+            *mean[mask].T,
+            angles="xy",
+            scale_units="xy",
+            scale=scale,
+            color=colour,
+            width=0.003,
+            clip_on=False,
         )
     axes.plot(interior.x0_px, interior.y0_px, "+", color=INK, ms=9)
     key = round_number(arrow_px)

@@ -21,7 +21,7 @@ class LengthUnit:
 
 
 METRIC = LengthUnit(whole="m", thousandth="mm")
-MODEL_UNITS = LengthUnit(whole="model units", thousandth="1/1000 unit")
+MODEL_UNITS = LengthUnit(whole="model units", thousandth="milli-units")
 
 
 def length_unit(result: OrientedBlock) -> LengthUnit:
