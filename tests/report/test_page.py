@@ -2,6 +2,7 @@
 
 import base64
 import io
+from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -296,8 +297,8 @@ def test_page_that_cannot_be_written(result: OrientedBlock, tmp_path: Path) -> N
         write_report(bare(result), tmp_path)
 
 
-def test_five_hundred_stills(make_result: object, tmp_path: Path) -> None:
-    large = make_result(strips=20, images_per_strip=25, points=1500)  # type: ignore[operator]
+def test_five_hundred_stills(make_result: Callable[..., OrientedBlock], tmp_path: Path) -> None:
+    large = make_result(strips=20, images_per_strip=25, points=1500)
     page = read(write_report(large, tmp_path))
     assert "Exterior orientation of each still (500 rows)" in page.titles
     assert len(page.table("Still", "Strip")) == 500

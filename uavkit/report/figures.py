@@ -180,7 +180,7 @@ def overlap_map(result: OrientedBlock, ground: Ground) -> Drawing:
     shown = ground if cells <= most else ground_surface(result, cells=max(int(100 * np.sqrt(most / cells)), 20))
     counts = overlap_counts(result, shown)
     west, east, south, north = extent_m(result)
-    figure = new_figure(float(np.clip(WIDTH_IN * 0.84 * (north - south) / (east - west), 2.4, 8.0)) + 0.5)
+    figure = new_figure(float(np.clip(WIDTH_IN * 0.79 * (north - south) / (east - west), 2.4, 8.0)) + 0.45)
     axes = figure.add_subplot()
     bounds = _overlap_bounds(counts)
     blues = mpl.colormaps["Blues"](np.linspace(0.25, 1.0, len(bounds) - 4))
@@ -200,7 +200,7 @@ def overlap_map(result: OrientedBlock, ground: Ground) -> Drawing:
     share = 100.0 * float(np.mean(covered >= 3)) if covered.size else 0.0
     caption = (
         f"Stills that see each place of the ground (hidden places are not looked for). {share:.0f} % of the ground "
-        f"seen at all is seen by three stills or more."
+        f"seen at all is seen by three stills or more. Beyond the points their nearest heights are taken."
     )
     return Drawing(name="overlap", title="Overlap", caption=caption, figure=figure)
 

@@ -60,23 +60,15 @@ def residual_vectors(result: OrientedBlock) -> Drawing:
     axes = figure.add_subplot()
     cell = interior.width_px / cells
     arrow_px = reach(np.hypot(*mean.T), 0.95, least=LEAST_ARROW_PX)
-    scale = arrow_px / (0.85 * cell)
-    large = np.hypot(*mean.T) > 3.5 * noise
-    for mask, colour in ((~large, BLUE), (large, RED)):
-        axes.quiver(
-            *middle[mask].T,
-            *mean[mask].T,
-            angles="xy",
-            scale_units="xy",
-            scale=scale,
-            color=colour,
-            width=0.003,
-            clip_on=False,
-        )
+    scale = arrow_px / min(0.85 * cell, interior.width_px / 14)
+    colours = np.where(np.hypot(*mean.T) > 3.5 * noise, RED, BLUE)
+    arrows = axes.quiver(
+        *middle.T, *mean.T, angles="xy", scale_units="xy", scale=scale, color=colours, width=0.003, clip_on=False
+    )
     axes.plot(interior.x0_px, interior.y0_px, "+", color=INK, ms=9)
     key = round_number(arrow_px)
-    arrows = axes.quiver([], [], [], [], angles="xy", scale_units="xy", scale=scale, color=INK, width=0.003)
-    axes.quiverkey(arrows, 0.88, 1.03, key, f"{key:g} px", labelpos="E", coordinates="axes")
+    axes.set_title(" ")  # keeps room for the key
+    axes.quiverkey(arrows, 0.86, 1.04, key, f"{key:g} px", labelpos="E", coordinates="axes", color=INK)
     axes.set(xlim=(-0.5, interior.width_px - 0.5), ylim=(interior.height_px - 0.5, -0.5), aspect="equal")
     plain_axes(axes, "Column [px]", "Row [px]")
     residuals = result.adjustment.ray_residuals_px[used]
