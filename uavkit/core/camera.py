@@ -89,6 +89,15 @@ class InteriorSigmas:
         """Return the sigmas in the order of INTERIOR_PARAMETERS, shape (10,)."""
         return np.array([getattr(self, name) for name in INTERIOR_PARAMETERS], dtype=np.float64)
 
+    def scaled(self, factor: float) -> "InteriorSigmas":
+        """Return the sigmas for pictures enlarged by a factor: those in pixels grow with it."""
+        return replace(
+            self,
+            principal_distance_px=self.principal_distance_px * factor,
+            x0_px=self.x0_px * factor,
+            y0_px=self.y0_px * factor,
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraProfile:

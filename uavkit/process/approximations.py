@@ -1,0 +1,326 @@
+"""Approximate orientation of a block from candidate points alone, in arbitrary position, rotation and scale.
+
+Relative orientation of a strong pair, then resection of one still after the other, intersection of new points, and
+an adjustment of what there is so far (incremental block formation, Mikhail, Bethel, McGlone 2001, sec. 5.8).
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from uavkit.core.adjustment import AdjustmentInput, AdjustmentOptions, AdjustmentResult, Datum
+from uavkit.core.arrays import Array, Flags, Indices
+from uavkit.core.camera import InteriorOrientation, InteriorSigmas, ideal_from_pixels
+from uavkit.core.collinearity import image_coordinates
+from uavkit.core.errors import AdjustmentError
+from uavkit.core.observations import Rays
+from uavkit.core.orientation import ExteriorOrientation
+from uavkit.core.progress import Progress
+from uavkit.process.bundle import adjust_block
+
+RESECTION_TOLERANCE_PX = 10.0
+"""A point agrees with a resection within this: lens distortion is not yet known."""
+LEAST_RESECTION_POINTS = 12
+LEAST_ANGLE_RAD = np.radians(2.0)
+"""Rays that meet at less do not fix a point's depth."""
+_IMAGE_FROM_VISION = np.diag([1.0, -1.0, -1.0])
+_ROUGH_SIGMA_PX = 1.0
+_MOST_POINTS_PER_STILL = 400
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RayTable:
+    """All rays of all candidates, in numbers of stills and points of the whole survey."""
+
+    point: Indices
+    image: Indices
+    xy_px: Array
+    directions: Array
+    """(k, 3) unit vectors in image space."""
+
+
+@dataclass(slots=True, kw_only=True)
+class GrowingBlock:
+    """State of the incremental orientation; rows of all stills and points, NaN where not known yet."""
+
+    interior: InteriorOrientation
+    centres: Array
+    rotations: Array
+    points: Array
+    reasons: dict[int, str]
+    result: AdjustmentResult | None = None
+
+    @property
+    def oriented(self) -> Flags:
+        """Tell which stills are oriented, shape (n,)."""
+        return np.asarray(np.isfinite(self.centres[:, 0]))
+
+    @property
+    def known(self) -> Flags:
+        """Tell which points are intersected, shape (m,)."""
+        return np.asarray(np.isfinite(self.points[:, 0]))
+
+
+def ray_table(point: Indices, image: Indices, xy_px: Array, interior: InteriorOrientation) -> RayTable:
+    """Return a table of rays with their directions under an interior orientation."""
+    ideal = ideal_from_pixels(xy_px, interior)
+    directions = np.column_stack([ideal[:, 0], -ideal[:, 1], -np.ones(len(ideal))])
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    return RayTable(point=point, image=image, xy_px=xy_px, directions=directions)
+
+
+def orient_approximately(
+    rays: RayTable,
+    counts: tuple[int, int],
+    interior: InteriorOrientation,
+    sigmas: InteriorSigmas,
+    progress: Progress,
+) -> GrowingBlock:
+    """Orient as many of the stills as hang together; ``counts`` is the number of stills and of points.
+
+    Raises AdjustmentError where not even two stills can be oriented to each other.
+    """
+    block = GrowingBlock(
+        interior=interior,
+        centres=np.full((counts[0], 3), np.nan),
+        rotations=np.full((counts[0], 3, 3), np.nan),
+        points=np.full((counts[1], 3), np.nan),
+        reasons={},
+    )
+    _start_with_pair(block, rays)
+    _intersect(block, rays)
+    next_adjustment, failed = 3, dict[int, int]()
+    while (image := _next_still(block, rays, failed)) is not None:
+        if _resect(block, rays, image):
+            _intersect(block, rays)
+            if int(block.oriented.sum()) >= next_adjustment:
+                rays = _adjust(block, rays, sigmas)
+                next_adjustment = int(np.ceil(1.25 * block.oriented.sum()))
+        else:
+            failed[image] = _known_points_in(block, rays)[image]
+        progress("approximate orientation", int(block.oriented.sum()), counts[0])
+    rays = _adjust(block, rays, sigmas)
+    _explain(block, rays)
+    return block
+
+
+def _known_points_in(block: GrowingBlock, rays: RayTable) -> Indices:
+    """Return how many intersected points each still sees, shape (n,)."""
+    return np.bincount(rays.image[block.known[rays.point]], minlength=len(block.centres))
+
+
+def _next_still(block: GrowingBlock, rays: RayTable, failed: dict[int, int]) -> int | None:
+    """Return the unoriented still that sees most known points; one that failed waits for 1.3 times as many."""
+    seen = _known_points_in(block, rays)
+    seen[block.oriented] = 0
+    for image, count in failed.items():
+        if seen[image] < 1.3 * count:
+            seen[image] = 0
+    best = int(np.argmax(seen))
+    return best if seen[best] >= LEAST_RESECTION_POINTS else None
+
+
+def common_points(rays: RayTable, images: int) -> Array:
+    """Return how many points each pair of stills has in common, shape (images, images)."""
+    from scipy.sparse import coo_matrix
+
+    seen = coo_matrix((np.ones(len(rays.point), np.float64), (rays.image, rays.point))).tocsr()
+    counts = (seen @ seen.T).toarray()
+    full = np.zeros((images, images))
+    full[: counts.shape[0], : counts.shape[1]] = counts
+    np.fill_diagonal(full, 0.0)
+    return full
+
+
+def _start_with_pair(block: GrowingBlock, rays: RayTable) -> None:
+    """Orient the pair with the most well-intersecting points, out of the twenty richest pairs."""
+    common = np.triu(common_points(rays, len(block.centres)))
+    richest = np.argsort(-common, axis=None, kind="stable")[:20]
+    best: tuple[float, int, int, Array, Array] | None = None
+    for flat in richest.tolist():
+        i, j = divmod(flat, len(common))
+        if common[i, j] < LEAST_RESECTION_POINTS:
+            continue
+        rotation, base, score = _relative_orientation(rays, i, j, block.interior)
+        if best is None or score > best[0]:
+            best = (score, i, j, rotation, base)
+    if best is None or best[0] <= 0:
+        raise AdjustmentError(
+            "no two stills have enough points in common that intersect well: the images do not overlap, are too "
+            "blurred, or were all taken from one place"
+        )
+    _, i, j, rotation, base = best
+    block.centres[i], block.rotations[i] = 0.0, np.eye(3)
+    block.centres[j], block.rotations[j] = base, rotation
+
+
+def _pair_rays(rays: RayTable, i: int, j: int) -> tuple[Indices, Indices]:
+    """Return the rows of the rays of the common points in still i and in still j."""
+    rows_i, rows_j = np.flatnonzero(rays.image == i), np.flatnonzero(rays.image == j)
+    _, at_i, at_j = np.intersect1d(rays.point[rows_i], rays.point[rows_j], return_indices=True)
+    return rows_i[at_i], rows_j[at_j]
+
+
+def _relative_orientation(rays: RayTable, i: int, j: int, interior: InteriorOrientation) -> tuple[Array, Array, float]:
+    """Return R_i_from_j, the base in image space of i (unit length), and a score: points that intersect well."""
+    rows_i, rows_j = _pair_rays(rays, i, j)
+    vision = [rays.directions[rows] @ _IMAGE_FROM_VISION for rows in (rows_i, rows_j)]
+    first, second = (v[:, :2] / v[:, 2:] for v in vision)
+    tolerance = RESECTION_TOLERANCE_PX / interior.principal_distance_px
+    essential, mask = cv2.findEssentialMat(first, second, np.eye(3), cv2.RANSAC, 0.9999, 0.5 * tolerance)
+    if essential is None or essential.shape != (3, 3):
+        return np.eye(3), np.zeros(3), 0.0
+    _, r_vision, t_vision, mask = cv2.recoverPose(essential, first, second, np.eye(3), mask=mask)
+    # x_j = R x_i + t in vision axes (y down, z forward): turn both ends to image space.
+    r_j_from_i = _IMAGE_FROM_VISION @ r_vision @ _IMAGE_FROM_VISION
+    base = -r_j_from_i.T @ (_IMAGE_FROM_VISION @ t_vision.ravel())
+    inliers = mask.ravel() > 0
+    to_j = rays.directions[rows_j] @ r_j_from_i
+    angle = np.arccos(np.clip(np.sum(rays.directions[rows_i] * to_j, axis=1), -1.0, 1.0))
+    if inliers.sum() < LEAST_RESECTION_POINTS:
+        return np.eye(3), np.zeros(3), 0.0
+    score = float(np.sum(np.minimum(angle[inliers], np.radians(20.0)) / np.radians(20.0)))
+    return r_j_from_i.T, base, score if float(np.median(angle[inliers])) > LEAST_ANGLE_RAD else 0.0
+
+
+def _resect(block: GrowingBlock, rays: RayTable, image: int) -> bool:
+    """Orient a still from the known points that it sees; tell whether that went well."""
+    rows = np.flatnonzero((rays.image == image) & block.known[rays.point])
+    vision = rays.directions[rows] @ _IMAGE_FROM_VISION
+    objects = np.ascontiguousarray(block.points[rays.point[rows]])
+    pixels = np.ascontiguousarray(vision[:, :2] / vision[:, 2:])
+    tolerance = RESECTION_TOLERANCE_PX / block.interior.principal_distance_px
+    done, vector, shift, inliers = cv2.solvePnPRansac(
+        objects,
+        pixels,
+        np.eye(3),
+        None,
+        iterationsCount=2000,
+        reprojectionError=tolerance,
+        confidence=0.9999,
+        flags=cv2.SOLVEPNP_SQPNP,
+    )
+    if not done or inliers is None or len(inliers) < LEAST_RESECTION_POINTS:
+        return False
+    chosen = inliers.ravel()
+    vector, shift = cv2.solvePnPRefineLM(objects[chosen], pixels[chosen], np.eye(3), None, vector, shift)
+    rotation = cv2.Rodrigues(vector)[0]
+    block.centres[image] = (-rotation.T @ shift).ravel()
+    block.rotations[image] = rotation.T @ _IMAGE_FROM_VISION
+    return True
+
+
+def intersect_linearly(point: Indices, origins: Array, directions: Array, count: int) -> tuple[Array, Array]:
+    """Return the points (count, 3) nearest to their rays, and the largest angle at which rays meet (approximate).
+
+    Normal equations of the distances to the rays; the smallest eigenvalue of the mean projector tells the angle.
+    """
+    projectors = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    normal = np.zeros((count, 3, 3))
+    right = np.zeros((count, 3))
+    np.add.at(normal, point, projectors)
+    np.add.at(right, point, np.einsum("kij,kj->ki", projectors, origins))
+    rays = np.maximum(np.bincount(point, minlength=count), 1)
+    # n rays spread by an angle a about their mean leave a smallest eigenvalue of about n (a / 2)^2.
+    least = np.maximum(np.linalg.eigvalsh(normal)[:, 0] / rays, 0.0)
+    angle = 2.0 * np.sqrt(least)
+    points = np.full((count, 3), np.nan)
+    good = angle > 1e-4
+    points[good] = np.linalg.solve(normal[good], right[good][:, :, None])[:, :, 0]
+    return points, angle
+
+
+def _intersect(block: GrowingBlock, rays: RayTable) -> None:
+    """Intersect all points that at least two oriented stills see, leaving out rays that do not fit."""
+    rows = np.flatnonzero(block.oriented[rays.image])
+    directions = np.einsum("kij,kj->ki", block.rotations[rays.image[rows]], rays.directions[rows])
+    origins = block.centres[rays.image[rows]]
+    fits = np.ones(len(rows), dtype=bool)
+    tolerance = RESECTION_TOLERANCE_PX / block.interior.principal_distance_px
+    for _ in range(3):
+        points, angle = intersect_linearly(rays.point[rows][fits], origins[fits], directions[fits], len(block.points))
+        to_point = points[rays.point[rows]] - origins
+        depth = np.sum(to_point * directions, axis=1)
+        with np.errstate(invalid="ignore"):
+            miss = np.linalg.norm(to_point - depth[:, None] * directions, axis=1) / depth
+            bad = ~(miss < tolerance) | ~(depth > 0)
+        worst = np.zeros(len(block.points))
+        np.maximum.at(worst, rays.point[rows], np.where(fits & bad, np.nan_to_num(miss, nan=1e9), 0.0))
+        drop = fits & bad & (np.nan_to_num(miss, nan=1e9) >= worst[rays.point[rows]])
+        if not drop.any():
+            break
+        fits &= ~drop
+    enough = np.bincount(rays.point[rows][fits & ~bad], minlength=len(block.points)) >= 2
+    points[~(enough & (angle > LEAST_ANGLE_RAD))] = np.nan
+    block.points = points
+
+
+def _adjust(block: GrowingBlock, rays: RayTable, sigmas: InteriorSigmas) -> RayTable:
+    """Adjust the block so far as a free network; returns the rays with directions of the new interior orientation."""
+    images = np.flatnonzero(block.oriented)
+    rows = np.flatnonzero(block.oriented[rays.image] & block.known[rays.point])
+    rows = rows[_well_spread(rays.image[rows], rays.point[rows], len(block.points))]
+    points, point_index = np.unique(rays.point[rows], return_inverse=True)
+    observations = AdjustmentInput(
+        interior=block.interior,
+        interior_sigmas=sigmas if len(images) >= 3 else InteriorSigmas(),
+        projection_centres_m=block.centres[images],
+        R_object_from_image=block.rotations[images],
+        points_m=block.points[points],
+        rays=Rays(
+            image_index=np.searchsorted(images, rays.image[rows]),
+            point_index=point_index,
+            xy_px=rays.xy_px[rows],
+            sigma_px=np.full((len(rows), 2), _ROUGH_SIGMA_PX),
+        ),
+    )
+    options = AdjustmentOptions(datum=Datum.FREE_NETWORK, most_iterations=15, convergence=0.05, point_covariances=False)
+    result = adjust_block(observations, options)
+    block.interior = result.interior
+    block.centres[images], block.rotations[images] = result.projection_centres_m, result.R_object_from_image
+    rays = ray_table(rays.point, rays.image, rays.xy_px, block.interior)
+    _intersect(block, rays)
+    return rays
+
+
+def _well_spread(image: Indices, point: Indices, count: int) -> Indices:
+    """Return rows of rays such that each still keeps its points of most rays, at most so many, and they all rays."""
+    rays_of = np.bincount(point, minlength=count)
+    order = np.lexsort((point, -rays_of[point], image))
+    starts = np.searchsorted(image[order], np.arange(int(image.max(initial=0)) + 1))
+    rank = np.arange(len(order)) - starts[image[order]]
+    chosen = np.zeros(count, dtype=bool)
+    chosen[point[order][rank < _MOST_POINTS_PER_STILL]] = True
+    return np.flatnonzero(chosen[point] & (rays_of[point] >= 2))
+
+
+def _explain(block: GrowingBlock, rays: RayTable) -> None:
+    """Say for each still why it is not oriented."""
+    seen, total = _known_points_in(block, rays), np.bincount(rays.image, minlength=len(block.centres))
+    for image in np.flatnonzero(~block.oriented).tolist():
+        if total[image] == 0:
+            block.reasons[image] = "no point of it was found in any other still: no overlap, blur, or no texture"
+        elif seen[image] < LEAST_RESECTION_POINTS:
+            block.reasons[image] = (
+                f"only {seen[image]} of its points are tied to the rest of the block ({LEAST_RESECTION_POINTS} needed)"
+            )
+        else:
+            block.reasons[image] = f"its {seen[image]} points do not agree on one orientation"
+
+
+def reprojection(block: GrowingBlock, rays: RayTable) -> Array:
+    """Return observed minus projected image points (k, 2) in pixels, NaN where still or point is not known."""
+    residuals = np.full((len(rays.point), 2), np.nan)
+    for image in np.flatnonzero(block.oriented).tolist():
+        rows = np.flatnonzero(rays.image == image)
+        exterior = ExteriorOrientation(
+            projection_centre_m=block.centres[image], R_object_from_image=block.rotations[image]
+        )
+        residuals[rows] = rays.xy_px[rows] - image_coordinates(block.points[rays.point[rows]], exterior, block.interior)
+    return residuals
+
+
+def with_sigmas(sigmas: InteriorSigmas, **values: float) -> InteriorSigmas:
+    """Return sigmas with some of them replaced."""
+    return replace(sigmas, **values)

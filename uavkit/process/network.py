@@ -1,0 +1,229 @@
+"""From candidates and approximations to adjustments: the rows that the bundle block adjustment takes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uavkit.core.adjustment import AdjustmentInput, AdjustmentOptions, AdjustmentResult, Datum
+from uavkit.core.arrays import Array, Indices
+from uavkit.core.block import Block
+from uavkit.core.camera import InteriorOrientation, InteriorSigmas
+from uavkit.core.observations import ControlObservations, GnssObservations, Rays
+from uavkit.core.points import CheckPoint, ControlPoint
+from uavkit.process.approximations import GrowingBlock, RayTable, intersect_linearly, ray_table
+from uavkit.process.bundle import adjust_block
+from uavkit.process.candidates import Candidates
+from uavkit.process.options import AdjustmentSection
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MarkedPoints:
+    """Rays to control and check points, by hand: c points, control first."""
+
+    points: tuple[ControlPoint | CheckPoint, ...]
+    control: int
+    """How many of them are control points."""
+    point: Indices
+    """(k,) row in ``points``."""
+    image: Indices
+    """(k,)."""
+    xy_px: Array
+    sigma_px: Array
+    """(k, 2)."""
+
+
+def marked_points(block: Block) -> MarkedPoints:
+    """Collect the marks of a block's control and check points; marks in stills not in the block are skipped."""
+    points: tuple[ControlPoint | CheckPoint, ...] = (*block.control_points, *block.check_points)
+    row_of = {still.name: row for row, still in enumerate(block.stills)}
+    rows = [
+        (number, row_of[mark.image], mark.column_px, mark.row_px, mark.sigma_px)
+        for number, point in enumerate(points)
+        for mark in point.marks
+        if mark.image in row_of
+    ]
+    table = np.array(rows, dtype=np.float64).reshape(-1, 5)
+    return MarkedPoints(
+        points=points,
+        control=len(block.control_points),
+        point=table[:, 0].astype(np.int64),
+        image=table[:, 1].astype(np.int64),
+        xy_px=table[:, 2:4],
+        sigma_px=np.repeat(table[:, 4:5], 2, axis=1),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Network:
+    """Everything to be adjusted, in rows of all stills; object points are the candidates, then the marked points."""
+
+    interior: InteriorOrientation
+    centres: Array
+    """(n, 3), NaN where a still is not oriented."""
+    rotations: Array
+    points: Array
+    """(m + c, 3), NaN where not known."""
+    point: Indices
+    image: Indices
+    xy_px: Array
+    sigma_px: Array
+    marks_from: int
+    """First row of the marked points."""
+
+
+def network_of(growing: GrowingBlock, candidates: Candidates, marked: MarkedPoints) -> Network:
+    """Join candidates and marks to one network, all points intersected anew."""
+    point, image, xy, sigma = candidates.all_rays()
+    m = len(candidates)
+    point = np.concatenate([point, m + marked.point])
+    image = np.concatenate([image, marked.image])
+    xy, sigma = np.concatenate([xy, marked.xy_px]), np.concatenate([sigma, marked.sigma_px])
+    rays = ray_table(point, image, xy, growing.interior)
+    return Network(
+        interior=growing.interior,
+        centres=growing.centres,
+        rotations=growing.rotations,
+        points=_robust_points(rays, growing, m + len(marked.points)),
+        point=point,
+        image=image,
+        xy_px=xy,
+        sigma_px=sigma,
+        marks_from=m,
+    )
+
+
+def _robust_points(rays: RayTable, growing: GrowingBlock, count: int) -> Array:
+    """Intersect points from their oriented rays, the worst ray of a point left out while it does not fit."""
+    rows = np.flatnonzero(np.isfinite(growing.centres[rays.image, 0]))
+    directions = np.einsum("kij,kj->ki", growing.rotations[rays.image[rows]], rays.directions[rows])
+    origins, point = growing.centres[rays.image[rows]], rays.point[rows]
+    fits = np.ones(len(rows), dtype=bool)
+    tolerance = 15.0 / growing.interior.principal_distance_px
+    for _ in range(4):
+        points, _ = intersect_linearly(point[fits], origins[fits], directions[fits], count)
+        to_point = points[point] - origins
+        depth = np.sum(to_point * directions, axis=1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            miss = np.linalg.norm(to_point - depth[:, None] * directions, axis=1) / np.abs(depth)
+        miss = np.where(np.isfinite(miss) & (depth > 0), miss, 1e9)
+        worst = np.zeros(count)
+        np.maximum.at(worst, point[fits], miss[fits])
+        drop = fits & (miss > tolerance) & (miss >= worst[point])
+        if not drop.any():
+            break
+        fits &= ~drop
+    points[np.bincount(point[fits], minlength=count) < 2] = np.nan
+    return points
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AdjustedNetwork:
+    """A result with the rows that it belongs to."""
+
+    result: AdjustmentResult
+    images: Indices
+    """Rows of the stills."""
+    points: Indices
+    """Rows of the network's object points."""
+    rays: Rays
+    ray_rows: Indices
+    """Rows of the network's rays."""
+
+
+def adjust_network(
+    network: Network,
+    block: Block,
+    marked: MarkedPoints,
+    options: AdjustmentSection,
+    datum: Datum | None,
+) -> AdjustedNetwork:
+    """Adjust; with ``datum`` FREE_NETWORK neither GNSS nor control take part."""
+    images = np.flatnonzero(np.isfinite(network.centres[:, 0]))
+    free = datum is Datum.FREE_NETWORK
+    rows = _rays_to_use(network, marked, free)
+    points, point_index = np.unique(network.point[rows], return_inverse=True)
+    rays = Rays(
+        image_index=np.searchsorted(images, network.image[rows]),
+        point_index=point_index,
+        xy_px=network.xy_px[rows],
+        sigma_px=network.sigma_px[rows],
+    )
+    observations = AdjustmentInput(
+        interior=network.interior,
+        interior_prior=block.interior,
+        interior_sigmas=interior_sigmas(block) if options.self_calibration else InteriorSigmas(),
+        projection_centres_m=network.centres[images],
+        R_object_from_image=network.rotations[images],
+        points_m=network.points[points],
+        rays=rays,
+        gnss=None if free or not options.gnss else _gnss(block, images),
+        control=None if free else _control(marked, points, network.marks_from),
+    )
+    settings = AdjustmentOptions(datum=datum, tukey_c=options.tukey_c, reject_above=options.reject_above)
+    check = np.flatnonzero(points >= network.marks_from + marked.control)
+    result = adjust_block(observations, settings, joint_points=None if free else check)
+    return AdjustedNetwork(result=result, images=images, points=points, rays=rays, ray_rows=rows)
+
+
+def interior_sigmas(block: Block) -> InteriorSigmas:
+    """Return the a priori sigmas of the interior orientation for the size of the block's stills."""
+    return block.camera.interior_sigmas.scaled(block.interior.width_px / block.camera.interior.width_px)
+
+
+def _rays_to_use(network: Network, marked: MarkedPoints, free: bool) -> Indices:
+    """Return the rays of oriented stills to known points that have at least two of them (one, for a control point)."""
+    usable = np.isfinite(network.centres[network.image, 0]) & np.isfinite(network.points[network.point, 0])
+    count = np.bincount(network.point[usable], minlength=len(network.points))
+    least = np.full(len(network.points), 2)
+    if not free:
+        least[network.marks_from : network.marks_from + marked.control] = 1
+    return np.flatnonzero(usable & (count >= least)[network.point])
+
+
+def _gnss(block: Block, images: Indices) -> GnssObservations | None:
+    """Return the GNSS observations of the oriented stills, in their rows."""
+    gnss = block.gnss
+    if gnss is None:
+        return None
+    keep = np.isin(gnss.image_index, images)
+    if not keep.any():
+        return None
+    return GnssObservations(
+        image_index=np.searchsorted(images, gnss.image_index[keep]),
+        position_m=gnss.position_m[keep],
+        sigma_m=gnss.sigma_m[keep],
+        flight=gnss.flight[keep],
+        lever_arm_m=gnss.lever_arm_m,
+        shift_sigma_m=gnss.shift_sigma_m,
+    )
+
+
+def _control(marked: MarkedPoints, points: Indices, marks_from: int) -> ControlObservations | None:
+    rows = np.flatnonzero((points >= marks_from) & (points < marks_from + marked.control))
+    if len(rows) == 0:
+        return None
+    chosen = [marked.points[int(points[row]) - marks_from] for row in rows]
+    return ControlObservations(
+        point_index=rows,
+        position_m=np.array([p.position_m for p in chosen]),
+        sigma_m=np.array([p.sigma_m for p in chosen]),
+    )
+
+
+def updated(network: Network, adjusted: AdjustedNetwork) -> Network:
+    """Return the network with the orientations, points and interior orientation of an adjustment."""
+    centres, rotations, points = network.centres.copy(), network.rotations.copy(), np.full_like(network.points, np.nan)
+    centres[adjusted.images] = adjusted.result.projection_centres_m
+    rotations[adjusted.images] = adjusted.result.R_object_from_image
+    points[adjusted.points] = adjusted.result.points_m
+    return Network(
+        interior=adjusted.result.interior,
+        centres=centres,
+        rotations=rotations,
+        points=points,
+        point=network.point,
+        image=network.image,
+        xy_px=network.xy_px,
+        sigma_px=network.sigma_px,
+        marks_from=network.marks_from,
+    )

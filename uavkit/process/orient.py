@@ -1,0 +1,382 @@
+"""From stills, video, positions and control to an oriented block: the processing core, step by step.
+
+Candidates (through the video, by features) -> approximate orientation -> tie point matching by back-projection ->
+variance components of the rays -> absolute orientation -> robust bundle block adjustment.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from uavkit.core.adjustment import Datum
+from uavkit.core.arrays import Array, content_hash
+from uavkit.core.block import Block
+from uavkit.core.cache import NoCache, StepCache
+from uavkit.core.devices import StillSource, VideoSource
+from uavkit.core.errors import AdjustmentError, InputError
+from uavkit.core.progress import Progress, silent
+from uavkit.core.result import OrientedBlock, PointOrigin
+from uavkit.process.absolute import robust_similarity
+from uavkit.process.approximations import GrowingBlock, orient_approximately, ray_table
+from uavkit.process.candidates import Candidates, empty, from_measurements, join
+from uavkit.process.features import feature_tasks, match_features, pairs_to_compare
+from uavkit.process.measurement import measure_rays
+from uavkit.process.network import (
+    AdjustedNetwork,
+    MarkedPoints,
+    Network,
+    adjust_network,
+    interior_sigmas,
+    marked_points,
+    network_of,
+    updated,
+)
+from uavkit.process.options import CandidateSource, ProcessOptions
+from uavkit.process.pictures import PictureStore
+from uavkit.process.ray_sigma import SigmaCalibration, calibrate_sigmas
+from uavkit.process.summary import Findings, peak_memory_mb, summarise
+from uavkit.process.tie_points import PyramidStore, TiePointMatching
+from uavkit.process.video_points import VideoInput, candidates_through_video
+
+_MOST_EXTRA_ROUNDS = 1
+
+
+@dataclass(kw_only=True)
+class Workplace:
+    """What every step needs besides its data; collects times and notes."""
+
+    block: Block
+    store: PictureStore
+    pyramids: PyramidStore
+    stills: StillSource
+    video: VideoSource | None
+    options: ProcessOptions
+    cache: StepCache
+    workers: int
+    progress: Progress
+    now_s: Callable[[], float]
+    seconds: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Time a step."""
+        begin = self.now_s()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + self.now_s() - begin
+
+
+def orient_block(
+    block: Block,
+    stills: StillSource,
+    video: VideoSource | None,
+    options: ProcessOptions | None = None,
+    *,
+    cache: StepCache | None = None,
+    workers: int = 1,
+    progress: Progress = silent,
+    now_s: Callable[[], float] = time.perf_counter,
+) -> OrientedBlock:
+    """Orient the stills of a block and adjust it; the result is the same to the last bit with any number of workers.
+
+    Raises InputError for stills that cannot be read or do not overlap, AdjustmentError where the observations do not
+    determine the block.
+    """
+    names = tuple(still.name for still in block.stills)
+    if len(names) < 2:
+        raise InputError(f"a block needs at least 2 stills, there are {len(names)}")
+    store = PictureStore(stills, names)
+    place = Workplace(
+        block=block,
+        store=store,
+        pyramids=PyramidStore(store),
+        stills=stills,
+        video=video,
+        options=options or ProcessOptions(),
+        cache=cache or NoCache(),
+        workers=workers,
+        progress=progress,
+        now_s=now_s,
+    )
+    candidates, growing = _approximate_block(place)
+    marked = marked_points(block)
+    tied, network = _tie(place, candidates, growing, marked)
+    with place.step("absolute orientation"):
+        network, oriented_absolutely = _to_object_space(place, network, marked)
+    with place.step("adjustment"):
+        place.progress("adjustment", 0, 1)
+        adjusted = adjust_network(
+            network, block, marked, place.options.adjustment, None if oriented_absolutely else Datum.FREE_NETWORK
+        )
+        place.progress("adjustment", 1, 1)
+    with place.step("summary"):
+        found = Findings(
+            block=block,
+            reasons=growing.reasons,
+            candidates=candidates,
+            tied=tied,
+            network=network,
+            marked=marked,
+            adjusted=adjusted,
+        )
+        result = summarise(found, stills, place.pyramids)
+    return replace(result, seconds=place.seconds, notes=tuple(place.notes), peak_memory_mb=peak_memory_mb())
+
+
+def _approximate_block(place: Workplace) -> tuple[Candidates, GrowingBlock]:
+    """Find candidates and orient them; stills that the video could not tie are tried again with features."""
+    candidates, weak = _first_candidates(place)
+    growing = _approximately(place, candidates, last=not weak)
+    source = place.options.candidates.source
+    for _ in range(_MOST_EXTRA_ROUNDS):
+        loose = set() if growing is None else set(np.flatnonzero(~growing.oriented).tolist())
+        if source is not CandidateSource.AUTO or (growing is not None and not loose) or not weak:
+            break
+        pairs = weak if growing is None else [pair for pair in weak if loose & set(pair)]
+        if not pairs:
+            break
+        place.notes.append(
+            f"the video did not tie {len(loose) or len(place.store)} stills: features were tried in {len(pairs)} pairs"
+        )
+        candidates = join([candidates, _feature_candidates(place, pairs)])
+        growing = _approximately(place, candidates, last=True)
+    if growing is None:  # not reached: the last attempt raises
+        raise AdjustmentError("no approximate orientation")
+    return candidates, growing
+
+
+def _first_candidates(place: Workplace) -> tuple[Candidates, list[tuple[int, int]]]:
+    """Return candidates by the way that the options name, and the pairs that features may be tried on afterwards."""
+    source = place.options.candidates.source
+    sync = place.block.video
+    pairs = pairs_to_compare(len(place.store), _positions(place.block), place.options.candidates.neighbours)
+    if place.video is None or sync is None or len(sync.places) < 2:
+        if source is CandidateSource.VIDEO:
+            raise InputError("candidates.source=video, but the block has no video that is synchronised with its stills")
+        return _feature_candidates(place, pairs), []
+    if source is CandidateSource.FEATURES:
+        return _feature_candidates(place, pairs), []
+    with place.step("tracking through the video"):
+        given = VideoInput(
+            video=place.video,
+            sync=sync,
+            store=place.store,
+            pyramids=place.pyramids,
+            candidates=place.options.candidates,
+            measurement=place.options.measurement,
+        )
+        through = candidates_through_video(given, place.cache, workers=place.workers, progress=place.progress)
+    parts, rest = [through.candidates], pairs
+    if source is CandidateSource.BOTH:
+        parts.append(_feature_candidates(place, pairs))
+    elif source is CandidateSource.AUTO:
+        gaps = sorted({*through.weak_pairs, *_unplaced_pairs(place)})
+        if gaps:
+            place.notes.append(f"{len(gaps)} gaps in the video: features bridge them")
+            parts.append(_feature_candidates(place, gaps))
+            rest = [pair for pair in pairs if pair not in gaps]
+    return join(parts), rest
+
+
+def _unplaced_pairs(place: Workplace) -> set[tuple[int, int]]:
+    """Return pairs of neighbouring stills of which one has no place in the video."""
+    sync = place.block.video
+    placed = {p.still for p in sync.places} if sync is not None else set()
+    return {
+        (row, row + 1)
+        for row in range(len(place.store) - 1)
+        if not {place.store.names[row], place.store.names[row + 1]} <= placed
+    }
+
+
+def _positions(block: Block) -> Array | None:
+    """Return a position for each still (n, 3), NaN where there is none."""
+    if block.gnss is None:
+        return None
+    positions = np.full((len(block.stills), 3), np.nan)
+    positions[block.gnss.image_index] = block.gnss.position_m
+    return positions
+
+
+def _feature_candidates(place: Workplace, pairs: list[tuple[int, int]]) -> Candidates:
+    """Match features on pairs of stills and measure the points by least squares matching."""
+    options, block = place.options, place.block
+    with place.step("features"):
+        matches = match_features(
+            place.store,
+            pairs,
+            block.interior,
+            options.candidates,
+            place.cache,
+            workers=place.workers,
+            progress=place.progress,
+        )
+        tasks = feature_tasks(matches, block.interior)
+    if len(tasks) == 0:
+        return empty()
+    with place.step("least squares matching"):
+        rays = measure_rays(
+            place.store,
+            tasks,
+            options.measurement,
+            workers=place.workers,
+            progress=place.progress,
+            stage="least squares matching",
+        )
+    return from_measurements(tasks, rays, PointOrigin.FEATURES)
+
+
+def _approximately(place: Workplace, candidates: Candidates, *, last: bool) -> GrowingBlock | None:
+    """Orient approximately; without success None, or the error where nothing else can be tried."""
+    point, image, xy, _ = candidates.all_rays()
+    block = place.block
+    try:
+        with place.step("approximate orientation"):
+            return orient_approximately(
+                ray_table(point, image, xy, block.interior),
+                (len(block.stills), len(candidates)),
+                block.interior,
+                interior_sigmas(block),
+                place.progress,
+            )
+    except AdjustmentError:
+        if last:
+            raise
+        return None
+
+
+def _tie(
+    place: Workplace, candidates: Candidates, growing: GrowingBlock, marked: MarkedPoints
+) -> tuple[Candidates, Network]:
+    """Find every point in every still that should see it, twice: the second time with the better orientation."""
+    matching = TiePointMatching(
+        store=place.store,
+        pyramids=place.pyramids,
+        options=place.options.measurement,
+        workers=place.workers,
+        progress=place.progress,
+    )
+    tied = candidates
+    for turn in (1, 2):
+        with place.step("free network"):
+            network = network_of(growing, tied, marked)
+            adjusted = _free_network(place, network, marked)
+            growing = _regrown(growing, updated(network, adjusted))
+        with place.step("tie points"):
+            tied = matching.match(candidates, growing, adjusted, known=None if turn == 1 else tied)
+    with place.step("free network"):
+        network = network_of(growing, tied, marked)
+        adjusted = _free_network(place, network, marked)
+        network, calibration = _calibrated(updated(network, adjusted), adjusted)
+        _note_calibration(place, calibration)
+    return tied, network
+
+
+def _free_network(place: Workplace, network: Network, marked: MarkedPoints) -> AdjustedNetwork:
+    place.progress("free network adjustment", 0, 1)
+    adjusted = adjust_network(network, place.block, marked, place.options.adjustment, Datum.FREE_NETWORK)
+    place.progress("free network adjustment", 1, 1)
+    return adjusted
+
+
+def _regrown(growing: GrowingBlock, network: Network) -> GrowingBlock:
+    return GrowingBlock(
+        interior=network.interior,
+        centres=network.centres,
+        rotations=network.rotations,
+        points=network.points[: network.marks_from],
+        reasons=growing.reasons,
+    )
+
+
+def _calibrated(network: Network, adjusted: AdjustedNetwork) -> tuple[Network, SigmaCalibration]:
+    """Return the network with the sigmas of its measured rays calibrated by variance components."""
+    result, rows = adjusted.result, adjusted.ray_rows
+    measured = network.point[rows] < network.marks_from
+    calibration = calibrate_sigmas(
+        result.ray_residuals_px[measured],
+        adjusted.rays.sigma_px[measured],
+        result.ray_redundancy[measured],
+        _angles_to_mean(network)[rows][measured],
+        result.ray_used[measured],
+    )
+    sigma = network.sigma_px.copy()
+    pooled = float(np.median(calibration.factor)) if len(calibration.factor) else 1.0
+    sigma[network.point < network.marks_from] *= pooled
+    sigma[rows[measured]] = adjusted.rays.sigma_px[measured] * calibration.factor[:, None]
+    return replace(network, sigma_px=sigma), calibration
+
+
+def _angles_to_mean(network: Network) -> Array:
+    """Return the angle (k,) of each ray to the mean direction of its point's rays, radians; 0 where not known."""
+    to_camera = network.centres[network.image] - network.points[network.point]
+    to_camera /= np.linalg.norm(to_camera, axis=1)[:, None]
+    known = np.isfinite(to_camera[:, 0])
+    mean = np.zeros((len(network.points), 3))
+    np.add.at(mean, network.point[known], to_camera[known])
+    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-12)[:, None]
+    cosine = np.sum(np.nan_to_num(to_camera) * mean[network.point], axis=1)
+    return np.asarray(np.where(known, np.arccos(np.clip(cosine, -1.0, 1.0)), 0.0))
+
+
+def _note_calibration(place: Workplace, calibration: SigmaCalibration) -> None:
+    if not calibration.classes:
+        return
+    factors = [factor for _, _, factor in calibration.classes]
+    place.notes.append(
+        f"sigmas of least squares matching calibrated by variance components in a free network: factors "
+        f"{min(factors):.2f} to {max(factors):.2f} in {len(factors)} classes of texture and angle"
+    )
+
+
+def _to_object_space(place: Workplace, network: Network, marked: MarkedPoints) -> tuple[Network, bool]:
+    """Transform the free network to object space by control, else by GNSS; tells whether that was possible."""
+    oriented = np.flatnonzero(np.isfinite(network.centres[:, 0]))
+    up = network.rotations[oriented][:, :, 2].mean(axis=0)
+    up = up / max(float(np.linalg.norm(up)), 1e-12)
+    model, target, sigma = _control_pairs(network, marked)
+    by_control = len(model) >= 3 and np.linalg.svd(target - target.mean(axis=0), compute_uv=False)[1] > 1.0
+    block = place.block
+    if not by_control:
+        if block.gnss is None or not place.options.adjustment.gnss:
+            return network, False
+        rows = np.isin(block.gnss.image_index, oriented)
+        model = network.centres[block.gnss.image_index[rows]]
+        target, sigma = block.gnss.position_m[rows], block.gnss.sigma_m[rows]
+        if len(model) < 3:
+            place.notes.append(f"only {len(model)} positions belong to oriented stills: position and scale stay free")
+            return network, False
+    similarity, _ = robust_similarity(model, target, sigma, up, np.random.default_rng(0))
+    moved = replace(
+        network,
+        centres=similarity.apply(network.centres),
+        rotations=similarity.R_object_from_model @ network.rotations,
+        points=similarity.apply(network.points),
+    )
+    return _with_single_ray_control(moved, marked), True
+
+
+def _control_pairs(network: Network, marked: MarkedPoints) -> tuple[Array, Array, Array]:
+    """Return control points in the model (c, 3), as surveyed (c, 3), and their sigmas (c, 3), where intersected."""
+    model = network.points[network.marks_from : network.marks_from + marked.control]
+    known = np.isfinite(model[:, 0])
+    chosen = [point for point, good in zip(marked.points[: marked.control], known, strict=True) if good]
+    target = np.array([p.position_m for p in chosen]).reshape(-1, 3)
+    return model[known], target, np.array([p.sigma_m for p in chosen]).reshape(-1, 3)
+
+
+def _with_single_ray_control(network: Network, marked: MarkedPoints) -> Network:
+    """Give control points that could not be intersected (one mark) their surveyed position as approximation."""
+    points = network.points.copy()
+    for number, point in enumerate(marked.points[: marked.control]):
+        if not np.isfinite(points[network.marks_from + number, 0]):
+            points[network.marks_from + number] = point.position_m
+    return replace(network, points=points)
+
+
+def options_key(options: ProcessOptions) -> str:
+    """Return a hash of the options: results of other options are out of date."""
+    return content_hash([repr(options)])

@@ -1,0 +1,44 @@
+"""Grey values of the stills in use, a few at a time: memory does not grow with the number of stills."""
+
+from collections import OrderedDict
+from threading import Lock
+
+from uavkit.core.arrays import Image
+from uavkit.core.devices import StillSource
+from uavkit.core.errors import InputError
+
+
+class PictureStore:
+    """Decoded stills, the least recently used forgotten first; safe to use from several threads."""
+
+    def __init__(self, source: StillSource, names: tuple[str, ...], capacity_mb: float = 600.0) -> None:
+        self._source = source
+        self._capacity_bytes = capacity_mb * 1e6
+        self._kept: OrderedDict[int, Image] = OrderedDict()
+        self._bytes = 0
+        self._lock = Lock()
+        self.names = names
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def grey(self, index: int) -> Image:
+        """Return the grey values (height, width) of a still by its row; raises InputError where it is unreadable."""
+        with self._lock:
+            if index in self._kept:
+                self._kept.move_to_end(index)
+                return self._kept[index]
+        picture = self._source.grey(self.names[index])
+        if picture.ndim != 2:
+            raise InputError(f"{self.names[index]}: grey values must be (height, width), are {picture.shape}")
+        with self._lock:
+            if index not in self._kept:
+                self._kept[index] = picture
+                self._bytes += picture.nbytes
+            while self._bytes > self._capacity_bytes and len(self._kept) > 2:
+                self._bytes -= self._kept.popitem(last=False)[1].nbytes
+        return picture
+
+    def fingerprint(self, index: int) -> str:
+        """Return the hash of a still's content."""
+        return self._source.fingerprint(self.names[index])

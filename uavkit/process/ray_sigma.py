@@ -1,0 +1,73 @@
+"""The a priori sigma of a ray measured by least squares matching."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uavkit.core.arrays import Array, Flags, Indices
+
+FORMAL_SCALE = 3.0
+"""Formal sigmas of least squares matching are 2 to 5 times too small (JPEG, interpolation, relief): the middle."""
+SIGMA_FLOOR_PX = 0.03
+"""What interpolation and the sensor's own geometry leave even where the texture is perfect."""
+_LEAST_IN_CLASS = 300
+_MOST_FACTOR = 6.0
+
+
+def ray_sigmas(pair_covariance_px2: Array) -> Array:
+    """Return sigma of column and row (n, 2) of rays from the formal covariances (n, 2, 2) of matched pairs.
+
+    Half of a pair's variance belongs to each of its two rays.
+    """
+    variance = 0.5 * np.einsum("nii->ni", pair_covariance_px2)
+    return np.asarray(np.sqrt(FORMAL_SCALE**2 * variance + SIGMA_FLOOR_PX**2))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SigmaCalibration:
+    """Factors by which the stated sigmas of classes of rays are multiplied."""
+
+    factor: Array
+    """(k,) of each ray."""
+    classes: tuple[tuple[str, int, float], ...]
+    """Name, number of rays and factor of each class, for the report."""
+
+
+def calibrate_sigmas(
+    residuals_px: Array, sigma_px: Array, redundancy: Array, angle_rad: Array, used: Flags
+) -> SigmaCalibration:
+    """Estimate variance components of rays by class of texture (stated sigma) and of angle to the reference's ray.
+
+    ``residuals_px``, ``sigma_px``, ``redundancy`` have shape (k, 2); ``angle_rad``, ``used`` (k,). The adjustment must
+    be one without control and GNSS, so that only the rays judge one another. The factor of a class is the root of the
+    sum of v^2 / sigma^2 over the sum of redundancy numbers (Foerstner 1979); small classes share one factor.
+    """
+    good = used & np.isfinite(redundancy).all(axis=1)
+    names, number = _classes(sigma_px.mean(axis=1), angle_rad, good)
+    squares = np.where(good[:, None], (residuals_px / sigma_px) ** 2, 0.0).sum(axis=1)
+    freedom = np.where(good[:, None], redundancy, 0.0).sum(axis=1)
+    pooled = _factor(squares[good].sum(), freedom[good].sum())
+    factors = np.full(len(names), pooled)
+    counts = np.bincount(number[good], minlength=len(names))
+    for index in range(len(names)):
+        rows = good & (number == index)
+        if counts[index] >= _LEAST_IN_CLASS:
+            factors[index] = _factor(squares[rows].sum(), freedom[rows].sum())
+    return SigmaCalibration(
+        factor=factors[number],
+        classes=tuple((names[i], int(counts[i]), float(factors[i])) for i in range(len(names)) if counts[i]),
+    )
+
+
+def _factor(squares: float, freedom: float) -> float:
+    return float(np.clip(np.sqrt(squares / freedom), 1.0 / _MOST_FACTOR, _MOST_FACTOR)) if freedom > 0 else 1.0
+
+
+def _classes(sigma_px: Array, angle_rad: Array, good: Flags) -> tuple[list[str], "Indices | NDArray[np.intp]"]:
+    """Return names and numbers of three classes of texture times three of angle."""
+    limits = np.quantile(sigma_px[good], [1 / 3, 2 / 3]) if good.any() else np.array([0.1, 0.2])
+    texture = np.searchsorted(limits, sigma_px)
+    angle = np.searchsorted(np.radians([12.0, 25.0]), angle_rad)
+    names = [f"{t} texture, {a}" for t in ("strong", "middle", "weak") for a in ("< 12 deg", "12-25 deg", "> 25 deg")]
+    return names, texture * 3 + angle

@@ -1,0 +1,301 @@
+"""Candidate pass points through the video: from still to still, old points carried on and new ones added.
+
+Anai et al. 2012, figure 7. Both stills take part as pictures of the sequence, reduced to the video's geometry, so an
+error of the transformation between still and video cancels.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from uavkit.core.arrays import Array, Flags, Image, Indices, content_hash
+from uavkit.core.block import StillInVideo, VideoSync
+from uavkit.core.cache import Arrays, StepCache
+from uavkit.core.devices import VideoSource
+from uavkit.core.errors import InputError
+from uavkit.core.progress import Progress, silent
+from uavkit.core.result import PointOrigin
+from uavkit.core.video import AffineTransformation, fields_of_frame
+from uavkit.process.candidates import Candidates
+from uavkit.process.measurement import RayTasks, measure_rays
+from uavkit.process.options import CandidateOptions, MeasurementOptions
+from uavkit.process.orientation_code import orientation_codes, richness, select_points
+from uavkit.process.pictures import PictureStore
+from uavkit.process.pyramid import PyramidOptions, full_from_level, refine_through_pyramid
+from uavkit.process.ray_sigma import ray_sigmas
+from uavkit.process.tie_points import PyramidStore
+from uavkit.process.tracking import TimedPicture, square_field, track
+
+_DETECTION_LEVEL = 2
+"""Points are chosen on the still at a quarter of its size: texture that the video can still show."""
+_VIDEO_RADIUS = 2.5
+"""How far a tracked position may be off, in video pixels."""
+_MOST_RAYS_CARRIED = 8
+LEAST_THROUGH_VIDEO = 20
+"""Verified points that make a gap between two stills bridged."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VideoInput:
+    """Everything that tracking through the video needs."""
+
+    video: VideoSource
+    sync: VideoSync
+    store: PictureStore
+    pyramids: PyramidStore
+    candidates: CandidateOptions
+    measurement: MeasurementOptions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VideoCandidates:
+    """Points through the video, and the pairs of stills between which it did not lead."""
+
+    candidates: Candidates
+    weak_pairs: list[tuple[int, int]]
+    matches: dict[int, Array]
+    """For each still the (n, 4) points of it that were found in the next one: column, row here and there."""
+
+
+@dataclass(slots=True, kw_only=True)
+class _Carried:
+    """Points alive in the present still."""
+
+    point: Indices
+    reference_image: Indices
+    reference_px: Array
+    here_px: Array
+    here_from_reference: Array
+    """(n, 2, 2)."""
+    rays: Indices
+
+
+def candidates_through_video(
+    given: VideoInput, cache: StepCache, *, workers: int, progress: Progress
+) -> VideoCandidates:
+    """Follow points through all gaps between stills that have a place in the video."""
+    places = given.sync.places
+    row_of = {name: row for row, name in enumerate(given.store.names)}
+    parts: list[tuple[Indices, Indices, Array, Array]] = []
+    references: list[tuple[Indices, Array]] = []
+    weak: list[tuple[int, int]] = []
+    matches: dict[int, Array] = {}
+    total, carried = 0, _nothing_carried()
+    for number, (here, there) in enumerate(pairwise(places)):
+        progress("tracking through the video", number, len(places) - 1)
+        image, target = row_of[here.still], row_of[there.still]
+        fresh = _new_points(given, image, carried.here_px)
+        references.append((np.full(len(fresh), image), fresh))
+        points = _with_new(carried, fresh, image, total)
+        total += len(fresh)
+        step = cache.arrays(
+            "video",
+            _gap_key(given, image, target, (here, there), points),
+            lambda here=here, there=there, target=target, points=points: _follow_gap(  # type: ignore[misc]
+                given, (here, there), target, points, workers
+            ),
+        )
+        ok = step["ok"]
+        parts.append((points.point[ok], np.full(int(ok.sum()), target), step["xy"][ok], step["sigma"][ok]))
+        matches[image] = np.column_stack([points.here_px[ok], step["xy"][ok]])
+        if int(ok.sum()) < LEAST_THROUGH_VIDEO:
+            weak.append((min(image, target), max(image, target)))
+        carried = _carried_on(points, ok, step["xy"], step["warps"])
+    progress("tracking through the video", len(places) - 1, len(places) - 1)
+    return VideoCandidates(candidates=_collected(references, parts), weak_pairs=weak, matches=matches)
+
+
+def _nothing_carried() -> _Carried:
+    none = np.zeros(0, dtype=np.int64)
+    return _Carried(
+        point=none,
+        reference_image=none,
+        reference_px=np.zeros((0, 2)),
+        here_px=np.zeros((0, 2)),
+        here_from_reference=np.zeros((0, 2, 2)),
+        rays=none,
+    )
+
+
+def _new_points(given: VideoInput, image: int, present_px: Array) -> Array:
+    """Choose points of highest orientation code richness, evenly spread, where no carried point is near; (n, 2)."""
+    pyramid = given.pyramids.get(image)
+    level = min(_DETECTION_LEVEL, len(pyramid.grey) - 1)
+    small = pyramid.grey[level]
+    cell_px = max(8, max(small.shape) // given.candidates.cells)
+    field = richness(orientation_codes(small))
+    chosen = full_from_level(select_points(field, cell_px, given.candidates.per_cell, 16), level)
+    if len(present_px) == 0 or len(chosen) == 0:
+        return chosen
+    nearest = np.min(np.linalg.norm(chosen[:, None] - present_px[None], axis=2), axis=1)
+    return np.asarray(chosen[nearest > 0.35 * cell_px * 2.0**level])
+
+
+def _with_new(carried: _Carried, fresh: Array, image: int, first_number: int) -> _Carried:
+    n = len(fresh)
+    return _Carried(
+        point=np.concatenate([carried.point, first_number + np.arange(n)]),
+        reference_image=np.concatenate([carried.reference_image, np.full(n, image)]),
+        reference_px=np.concatenate([carried.reference_px, fresh]),
+        here_px=np.concatenate([carried.here_px, fresh]),
+        here_from_reference=np.concatenate([carried.here_from_reference, np.tile(np.eye(2), (n, 1, 1))]),
+        rays=np.concatenate([carried.rays, np.zeros(n, dtype=np.int64)]),
+    )
+
+
+def _carried_on(points: _Carried, ok: Flags, xy_px: Array, warps: Array) -> _Carried:
+    keep = ok & (points.rays < _MOST_RAYS_CARRIED)
+    return _Carried(
+        point=points.point[keep],
+        reference_image=points.reference_image[keep],
+        reference_px=points.reference_px[keep],
+        here_px=xy_px[keep],
+        here_from_reference=warps[keep],
+        rays=points.rays[keep] + 1,
+    )
+
+
+def _gap_key(
+    given: VideoInput, image: int, target: int, places: tuple[StillInVideo, StillInVideo], points: _Carried
+) -> str:
+    sync = given.sync
+    return content_hash(
+        [
+            "video 1",
+            given.video.fingerprint(),
+            given.store.fingerprint(image),
+            given.store.fingerprint(target),
+            repr(places),
+            repr((sync.field_order, sync.frame_interval_ns, given.measurement)),
+            sync.still_from_video.matrix,
+            sync.still_from_video.shift,
+            points.reference_image,
+            points.reference_px,
+            points.here_px,
+            points.here_from_reference,
+        ]
+    )
+
+
+def _follow_gap(
+    given: VideoInput, places: tuple[StillInVideo, StillInVideo], target: int, points: _Carried, workers: int
+) -> Arrays:
+    """Track points of one still to the next, descend to its pixels, and measure them against their references."""
+    xy, alive, there_from_here = track_between_stills(given, places, points.here_px)
+    warps = there_from_here @ points.here_from_reference
+    radius = _VIDEO_RADIUS * float(np.sqrt(abs(np.linalg.det(given.sync.still_from_video.matrix))))
+    found = np.zeros(len(xy), dtype=bool)
+    for reference in np.unique(points.reference_image[alive]).tolist():
+        rows = np.flatnonzero(alive & (points.reference_image == reference))
+        refined = refine_through_pyramid(
+            given.pyramids.get(reference),
+            given.pyramids.get(target),
+            points.reference_px[rows],
+            xy[rows],
+            warps[rows],
+            PyramidOptions(start_radius_px=radius),
+        )
+        xy[rows[refined.ok]], found[rows] = refined.target_px[refined.ok], refined.ok
+    return _measured(given, target, points, xy, warps, found, workers)
+
+
+def _measured(
+    given: VideoInput, target: int, points: _Carried, xy: Array, warps: Array, found: Flags, workers: int
+) -> Arrays:
+    rows = np.flatnonzero(found)
+    tasks = RayTasks(
+        point=points.point[rows],
+        reference_image=points.reference_image[rows],
+        reference_px=points.reference_px[rows],
+        target_image=np.full(len(rows), target),
+        start_px=xy[rows],
+        warps=warps[rows],
+    )
+    rays = measure_rays(given.store, tasks, given.measurement, workers=workers, progress=silent, stage="")
+    ok, sigma = np.zeros(len(xy), dtype=bool), np.full((len(xy), 2), np.nan)
+    ok[rows] = rays.ok
+    sigma[rows] = ray_sigmas(rays.covariance_px2)
+    xy, warps = xy.copy(), warps.copy()
+    xy[rows], warps[rows] = rays.target_px, rays.warps
+    return {"ok": ok, "xy": xy, "warps": warps, "sigma": sigma}
+
+
+def track_between_stills(
+    given: VideoInput, places: tuple[StillInVideo, StillInVideo], here_px: Array
+) -> tuple[Array, Flags, Array]:
+    """Follow points (n, 2) of one still through the video to the next one.
+
+    Returns where they are there (n, 2) in still pixels, which were found, and there_from_here (n, 2, 2) about each.
+    """
+    nothing = here_px.copy(), np.zeros(len(here_px), dtype=bool), np.tile(np.eye(2), (len(here_px), 1, 1))
+    video_from_still = given.sync.still_from_video.inverse()
+    info = given.video.info()
+    start = video_from_still.apply(here_px)
+    inside = np.all((start > 12) & (start < np.array([info.width_px - 13, info.height_px - 13])), axis=1)
+    if int(inside.sum()) < 6:
+        return nothing
+    pictures = _pictures_between(given, places, (info.height_px, info.width_px))
+    try:
+        result = track(pictures, start[inside], rng=np.random.default_rng(places[0].last_frame))
+    except InputError:
+        return nothing
+    end_s = places[1].exposure_time_ns * 1e-9
+    xy, alive, warps = nothing
+    xy[inside] = given.sync.still_from_video.apply(result.points_px)
+    alive[inside] = result.alive & (abs(result.time_s - end_s) < 1e-6)
+    scale = given.sync.still_from_video.matrix
+    warps[inside] = scale @ result.warps @ np.linalg.inv(scale)
+    return xy, alive, warps
+
+
+def _pictures_between(
+    given: VideoInput, places: tuple[StillInVideo, StillInVideo], shape: tuple[int, int]
+) -> Iterator[TimedPicture]:
+    """Yield the first still, all fields between the two shutters, and the second still, all in video geometry."""
+    here, there = places
+    names = given.store.names
+    yield TimedPicture(
+        image=still_as_video(given.store.grey(names.index(here.still)), given.sync.still_from_video, shape),
+        time_s=here.exposure_time_ns * 1e-9,
+    )
+    for frame in given.video.frames(here.first_frame, there.last_frame):
+        for field in fields_of_frame(frame, given.sync.field_order, given.sync.frame_interval_ns):
+            image = field.lines if field.row_step == 1 else square_field(field.lines, field.first_row)
+            yield TimedPicture(image=image, time_s=field.time_ns * 1e-9, usable=not frame.damaged)
+    yield TimedPicture(
+        image=still_as_video(given.store.grey(names.index(there.still)), given.sync.still_from_video, shape),
+        time_s=there.exposure_time_ns * 1e-9,
+    )
+
+
+def still_as_video(grey: Image, still_from_video: AffineTransformation, shape: tuple[int, int]) -> Image:
+    """Return a still as the video would show it: (height, width), averaged over the area of a video pixel."""
+    scale = float(np.sqrt(abs(np.linalg.det(still_from_video.matrix))))
+    soft = cv2.GaussianBlur(grey, (0, 0), 0.5 * scale) if scale > 1.2 else grey
+    matrix = np.column_stack([still_from_video.matrix, still_from_video.shift])
+    warped = cv2.warpAffine(
+        soft,
+        matrix,
+        (shape[1], shape[0]),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return np.asarray(warped, dtype=np.uint8)
+
+
+def _collected(
+    references: list[tuple[Indices, Array]], parts: list[tuple[Indices, Indices, Array, Array]]
+) -> Candidates:
+    reference_image = np.concatenate([r[0] for r in references]) if references else np.zeros(0, np.int64)
+    return Candidates(
+        reference_image=reference_image,
+        reference_px=np.concatenate([r[1] for r in references]) if references else np.zeros((0, 2)),
+        origin=np.full(len(reference_image), PointOrigin.VIDEO, dtype=np.int8),
+        ray_point=np.concatenate([p[0] for p in parts]) if parts else np.zeros(0, np.int64),
+        ray_image=np.concatenate([p[1] for p in parts]) if parts else np.zeros(0, np.int64),
+        ray_px=np.concatenate([p[2] for p in parts]) if parts else np.zeros((0, 2)),
+        ray_sigma_px=np.concatenate([p[3] for p in parts]) if parts else np.zeros((0, 2)),
+    )
