@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from uavkit.core.arrays import Array, Flags, Indices
 from uavkit.core.result import PointOrigin
 from uavkit.process.measurement import MeasuredRays, RayTasks
-from uavkit.process.ray_sigma import ray_sigmas
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,5 +120,5 @@ def from_measurements(tasks: RayTasks, rays: MeasuredRays, origin: PointOrigin) 
         ray_point=point.astype(np.int64),
         ray_image=tasks.target_image[ok],
         ray_px=rays.target_px[ok],
-        ray_sigma_px=ray_sigmas(rays.covariance_px2[ok]),
+        ray_sigma_px=rays.sigma_px[ok],
     )

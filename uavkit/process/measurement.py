@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from uavkit.core.arrays import Array, Flags, Indices
 from uavkit.core.progress import Progress
-from uavkit.process.least_squares_matching import MatchingOptions, MatchingStatus, match_forward_backward
+from uavkit.process.least_squares_matching import MatchingOptions, MatchingStatus, match_forward_backward, ray_sigma
 from uavkit.process.options import MeasurementOptions
 from uavkit.process.pictures import PictureStore
 
@@ -52,12 +52,8 @@ class MeasuredRays:
     """(k, 2)."""
     warps: Array
     """(k, 2, 2)."""
-    covariance_px2: Array
-    """(k, 2, 2) formal, of the pair."""
-    return_miss_px: Array
-    """(k, 2)."""
-    correlation: Array
-    """(k,)."""
+    sigma_px: Array
+    """(k, 2) a priori sigma of each of the two rays of the pair."""
     status: NDArray[np.int64]
     """(k,) MatchingStatus."""
 
@@ -85,9 +81,8 @@ def measure_rays(
         most_return_miss_px=options.most_return_miss_px,
     )
     k = len(tasks)
-    target_px, miss = np.full((k, 2), np.nan), np.full((k, 2), np.nan)
-    warps, covariance = np.full((k, 2, 2), np.nan), np.full((k, 2, 2), np.nan)
-    correlation, status = np.full(k, np.nan), np.full(k, int(MatchingStatus.LEFT_IMAGE), dtype=np.int64)
+    target_px, sigma_px, warps = np.full((k, 2), np.nan), np.full((k, 2), np.nan), np.full((k, 2, 2), np.nan)
+    status = np.full(k, int(MatchingStatus.LEFT_IMAGE), dtype=np.int64)
     pairs = pairs_of(tasks)
     for done, (reference, target, rows) in enumerate(pairs):
         progress(stage, done, len(pairs))
@@ -101,15 +96,13 @@ def measure_rays(
             workers=workers,
         )
         forward = both.forward
-        target_px[rows], warps[rows], covariance[rows] = forward.target_px, forward.warps, forward.covariance_px2
-        correlation[rows], status[rows], miss[rows] = forward.correlation, forward.status, both.return_miss_px
+        target_px[rows], warps[rows], status[rows] = forward.target_px, forward.warps, forward.status
+        sigma_px[rows] = ray_sigma(forward, both.return_miss_px)
     progress(stage, len(pairs), len(pairs))
     return MeasuredRays(
         ok=np.asarray(status == MatchingStatus.OK),
         target_px=target_px,
         warps=warps,
-        covariance_px2=covariance,
-        return_miss_px=miss,
-        correlation=correlation,
+        sigma_px=sigma_px,
         status=status,
     )

@@ -1,4 +1,4 @@
-"""The a priori sigma of a ray measured by least squares matching."""
+"""Variance components: what a block says of the a priori sigmas of its rays, by texture and angle."""
 
 from dataclasses import dataclass
 
@@ -7,21 +7,8 @@ from numpy.typing import NDArray
 
 from uavkit.core.arrays import Array, Flags, Indices
 
-FORMAL_SCALE = 3.0
-"""Formal sigmas of least squares matching are 2 to 5 times too small (JPEG, interpolation, relief): the middle."""
-SIGMA_FLOOR_PX = 0.03
-"""What interpolation and the sensor's own geometry leave even where the texture is perfect."""
 _LEAST_IN_CLASS = 300
-_MOST_FACTOR = 6.0
-
-
-def ray_sigmas(pair_covariance_px2: Array) -> Array:
-    """Return sigma of column and row (n, 2) of rays from the formal covariances (n, 2, 2) of matched pairs.
-
-    Half of a pair's variance belongs to each of its two rays.
-    """
-    variance = 0.5 * np.einsum("nii->ni", pair_covariance_px2)
-    return np.asarray(np.sqrt(FORMAL_SCALE**2 * variance + SIGMA_FLOOR_PX**2))
+_MOST_FACTOR = 20.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -25,7 +25,6 @@ from uavkit.process.network import AdjustedNetwork
 from uavkit.process.options import MeasurementOptions
 from uavkit.process.pictures import PictureStore
 from uavkit.process.pyramid import ImagePyramid, PyramidOptions, build_pyramid, refine_through_pyramid
-from uavkit.process.ray_sigma import ray_sigmas
 
 _PROBE_PX = 8.0
 _MOST_OBLIQUE = np.cos(np.radians(72.0))
@@ -215,7 +214,7 @@ class TiePointMatching:
         )
         near = np.linalg.norm(rays.target_px - tasks.start_px, axis=1) < 4.0
         ok = rays.ok & near
-        parts = [(tasks.point[ok], tasks.target_image[ok], rays.target_px[ok], ray_sigmas(rays.covariance_px2[ok]))]
+        parts = [(tasks.point[ok], tasks.target_image[ok], rays.target_px[ok], rays.sigma_px[ok])]
         if known is not None:
             parts.append((known.ray_point, known.ray_image, known.ray_px, known.ray_sigma_px))
         point, image, xy, sigma = (np.concatenate(column) for column in zip(*parts, strict=True))

@@ -25,7 +25,6 @@ from uavkit.process.options import CandidateOptions, MeasurementOptions
 from uavkit.process.orientation_code import orientation_codes, richness, select_points
 from uavkit.process.pictures import PictureStore
 from uavkit.process.pyramid import PyramidOptions, full_from_level, refine_through_pyramid
-from uavkit.process.ray_sigma import ray_sigmas
 from uavkit.process.tie_points import PyramidStore
 from uavkit.process.tracking import TimedPicture, square_field, track
 
@@ -217,7 +216,7 @@ def _measured(
     rays = measure_rays(given.store, tasks, given.measurement, workers=workers, progress=silent, stage="")
     ok, sigma = np.zeros(len(xy), dtype=bool), np.full((len(xy), 2), np.nan)
     ok[rows] = rays.ok
-    sigma[rows] = ray_sigmas(rays.covariance_px2)
+    sigma[rows] = rays.sigma_px
     xy, warps = xy.copy(), warps.copy()
     xy[rows], warps[rows] = rays.target_px, rays.warps
     return {"ok": ok, "xy": xy, "warps": warps, "sigma": sigma}
