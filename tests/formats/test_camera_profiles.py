@@ -169,7 +169,6 @@ def test_profiles_are_found_where_a_wheel_puts_them(tmp_path: Path, monkeypatch:
         camera_folder()
 
 
-@pytest.mark.slow
 def test_a_built_wheel_holds_the_profiles(tmp_path: Path) -> None:
     pytest.importorskip("hatchling")
     if not (ROOT / "README.md").is_file():
