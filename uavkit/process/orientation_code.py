@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from uavkit.core.arrays import Array
 from uavkit.core.errors import InputError
-from uavkit.process.kernels.code_matching import PATCH_STRIDE, code_templates, equal_slopes, match_packed
+from uavkit.process.kernels.code_matching import code_templates, equal_slopes, match_packed, strip_spacing
 from uavkit.process.kernels.coding import code_picture, richness_picture, second_difference_histogram
 
 Codes = NDArray[np.uint8]
@@ -27,6 +27,7 @@ NOISE_TO_THRESHOLD = 8.0
 """gamma in units of the noise of one pixel: |dIx| + |dIy| of pure noise has mean 5.5 and standard deviation 3."""
 LEAST_THRESHOLD = 12
 """gamma for a picture without noise: 1.5 grey values a pixel, as Sobel's gradient is 8 times the slope."""
+_TEMPLATES_AT_ONCE = 64  # what fits into the second level cache
 _LARGEST_FACTOR = 31  # a Sobel gradient (1020) times this stays in 16 bits
 
 
@@ -248,24 +249,19 @@ def match_codes_at(
     if window_px % 2 == 0:
         raise InputError(f"window_px must be odd, is {window_px}")
     count = plan.predicted_px.shape[0]
-    stride = PATCH_STRIDE * (-(-window_px // PATCH_STRIDE))
-    templates = np.zeros((count, window_px, stride), np.uint8)
-    coded_share = np.empty(count)
+    found, scores, coded_share = np.empty((count, 2)), np.empty((count, 3)), np.empty(count)
+    geometry = [np.ascontiguousarray(a, np.float64) for a in (plan.reference_px, plan.reference_from_target)]
     predicted = np.ascontiguousarray(plan.predicted_px, np.float64)
-    code_templates(
-        reference,
-        np.ascontiguousarray(plan.reference_px, np.float64),
-        np.ascontiguousarray(plan.reference_from_target, np.float64),
-        predicted,
-        threshold,
-        sector_tangents(),
-        templates,
-        coded_share,
-    )
-    radii = np.where(coded_share < 0, 0, plan.radii_px)
     uncoded = np.array([64, 64 if variant is Dissimilarity.PAPER else 0], np.uint8)
-    found, scores = np.empty((count, 2)), np.empty((count, 3))
-    match_packed(templates, search_packed, window_px, predicted, radii, uncoded, 2, found, scores)
+    picture = np.ascontiguousarray(reference)
+    grey = np.zeros((window_px + 2, (_TEMPLATES_AT_ONCE + 1) * strip_spacing(window_px)), np.uint8)
+    strip = np.empty_like(grey)
+    for begin in range(0, count, _TEMPLATES_AT_ONCE):
+        rows = slice(begin, begin + _TEMPLATES_AT_ONCE)
+        places = geometry[0][rows], geometry[1][rows], predicted[rows]
+        code_templates(picture, *places, threshold, sector_tangents(), grey, strip, coded_share[rows])
+        radii = np.where(coded_share[rows] < 0, 0, plan.radii_px[rows])
+        match_packed(strip, search_packed, window_px, predicted[rows], radii, uncoded, 2, found[rows], scores[rows])
     step = 256 // CODE_COUNT
     return PointMatches(
         points_px=found,

@@ -1,8 +1,8 @@
 """Matching of orientation codes and warping of grey-value patches: inner loops.
 
 Codes are packed into bytes: code * (256 / N), so that the circular difference is the plain difference of signed bytes,
-which wraps by itself; an uncoded pixel is 1 (no packed code is odd). Patches are padded to PATCH_STRIDE columns, so
-that a row is one or two vector registers.
+which wraps by itself; an uncoded pixel is 1 (no packed code is odd). Templates lie side by side in a strip, each in a
+multiple of PATCH_STRIDE columns: they are coded in long rows, and a row of one is a vector register or two.
 """
 
 import numpy as np
@@ -21,14 +21,15 @@ def warp_patch(
     centre: NDArray[np.float64],
     source_from_patch: NDArray[np.float64],
     shift: NDArray[np.float64],
-    patch: NDArray[np.uint8],
+    strip: NDArray[np.uint8],
+    begin: int,
 ) -> bool:
-    """Bilinear grey values of patch (m, m): pixel p comes from centre + source_from_patch (p - m // 2 - shift).
+    """Bilinear grey values of a patch (m, m): pixel p comes from centre + source_from_patch (p - m // 2 - shift).
 
-    Returns False, with the patch unfinished, where the patch reaches beyond the image.
+    The patch lies in strip (m, ...) from column begin on. Returns False where it would reach beyond the image.
     """
     rows, columns = image.shape
-    size = patch.shape[0]
+    size = strip.shape[0]
     half = size // 2
     a, b = source_from_patch[0, 0], source_from_patch[0, 1]
     c, d = source_from_patch[1, 0], source_from_patch[1, 1]
@@ -38,6 +39,7 @@ def warp_patch(
     if not (reach_x <= centre[0] < columns - 1 - reach_x and reach_y <= centre[1] < rows - 1 - reach_y):
         return False
     flat = image.ravel()
+    stride, right = np.uint64(columns), np.uint64(1)
     one = 65536.0
     ax, cy = np.int64(np.round(a * one)), np.int64(np.round(c * one))
     for row in range(size):
@@ -45,12 +47,15 @@ def warp_patch(
         start = -half - shift[0]
         u = np.int64(np.floor((centre[0] + a * start + b * x) * one + 0.5))
         v = np.int64(np.floor((centre[1] + c * start + d * x) * one + 0.5))
+        line = strip[row, begin : begin + size]
         for column in range(size):
-            index = (v >> 16) * columns + (u >> 16)
-            fu, fv = (u & 65535) >> 8, (v & 65535) >> 8
-            upper = np.int64(flat[index]) * (256 - fu) + np.int64(flat[index + 1]) * fu
-            lower = np.int64(flat[index + columns]) * (256 - fu) + np.int64(flat[index + columns + 1]) * fu
-            patch[row, column] = (upper * (256 - fv) + lower * fv + 32768) >> 16
+            # unsigned, or every index is tested for being negative
+            at = np.uint64((v >> 16) * columns + (u >> 16))
+            below = at + stride
+            fu, fv = np.int32((u >> 8) & 255), np.int32((v >> 8) & 255)
+            upper = (np.int32(flat[at]) << 8) + fu * (np.int32(flat[at + right]) - np.int32(flat[at]))
+            lower = (np.int32(flat[below]) << 8) + fu * (np.int32(flat[below + right]) - np.int32(flat[below]))
+            line[column] = np.uint8(((upper << 8) + fv * (lower - upper) + 32768) >> 16)
             u += ax
             v += cy
     return True
@@ -134,7 +139,7 @@ def _best_two(totals: NDArray[np.int64], size: int, apart: int, best: NDArray[np
 
 @kernel
 def match_packed(
-    templates: NDArray[np.uint8],
+    strip: NDArray[np.uint8],
     search: NDArray[np.uint8],
     size: int,
     predicted: NDArray[np.float64],
@@ -144,19 +149,21 @@ def match_packed(
     found: NDArray[np.float64],
     scores: NDArray[np.float64],
 ) -> None:
-    """Match templates (n, m, stride), whose shift is the fraction of predicted (n, 2), in packed codes search (h, w).
+    """Match the templates of a strip, shifted by the fraction of predicted (n, 2), in packed codes search (h, w).
 
     found (n, 2) gets the sub-pixel position; scores (n, 3) the mean packed difference of the best placement, of the
     second best well apart (nan without one), and 1 where the best lies on the rim of the search. Nan where the search
     leaves the picture.
     """
     rows, columns = search.shape
-    stride = templates.shape[2]
+    spacing = strip_spacing(size)
+    stride = PATCH_STRIDE * ((size + PATCH_STRIDE - 1) // PATCH_STRIDE)
     half = size // 2
     largest = 1
     for point in range(radii.shape[0]):
         largest = max(largest, radii[point])
     totals = np.empty((2 * largest + 1, 2 * largest + 1), np.int64)
+    template = np.empty((size, stride), np.uint8)
     mask = np.zeros(stride, np.uint8)
     mask[:size] = 255
     best = np.zeros(4, np.int64)
@@ -174,7 +181,8 @@ def match_packed(
             continue
         if window[0] + radius + size > rows or window[1] + radius + stride > columns:
             continue
-        _search(templates[point], mask, search, window, uncoded, totals)
+        template[:] = strip[1 : size + 1, point * spacing + 1 : point * spacing + 1 + stride]
+        _search(template, mask, search, window, uncoded, totals)
         _best_two(totals, 2 * radius + 1, apart, best)
         down, right = best[0], best[1]
         on_rim = down == 0 or right == 0 or down == 2 * radius or right == 2 * radius
@@ -190,6 +198,12 @@ def match_packed(
 
 
 @kernel
+def strip_spacing(size: int) -> int:
+    """Columns of a strip from one template to the next: the window and a pixel on either side, in whole registers."""
+    return PATCH_STRIDE * ((size + 2 + PATCH_STRIDE - 1) // PATCH_STRIDE)
+
+
+@kernel
 def code_templates(
     image: NDArray[np.uint8],
     centres: NDArray[np.float64],
@@ -197,28 +211,34 @@ def code_templates(
     predicted: NDArray[np.float64],
     threshold: int,
     tangents: NDArray[np.int16],
-    templates: NDArray[np.uint8],
+    grey: NDArray[np.uint8],
+    strip: NDArray[np.uint8],
     coded_share: NDArray[np.float64],
 ) -> None:
-    """Warp a grey patch for each point, then code it, into templates (n, m, stride); coded_share -1: outside."""
-    size = templates.shape[1]
-    grey = np.empty((size + 2, size + 2), np.uint8)
-    codes = np.empty((size + 2, size + 2), np.uint8)
+    """Warp a grey patch for each point, side by side into grey (m + 2, ...), and code them all at once into strip.
+
+    The window of point i is rows 1 to m and m columns from i * strip_spacing(m) + 1 on. coded_share (n,) is -1 where
+    the patch would reach beyond its picture.
+    """
+    size = grey.shape[0] - 2
+    spacing = strip_spacing(size)
     shift = np.zeros(2)
-    step = 256 // (4 * (tangents.shape[0] + 1))
     for point in range(centres.shape[0]):
         coded_share[point] = -1.0
         if not (np.isfinite(predicted[point, 0]) and np.isfinite(predicted[point, 1])):
             continue
         shift[0] = predicted[point, 0] - np.floor(predicted[point, 0] + 0.5)
         shift[1] = predicted[point, 1] - np.floor(predicted[point, 1] + 0.5)
-        if not warp_patch(image, centres[point], source_from_patch[point], shift, grey):
+        if warp_patch(image, centres[point], source_from_patch[point], shift, grey, point * spacing):
+            coded_share[point] = 0.0
+    code_picture(grey, threshold, tangents, 256 // (4 * (tangents.shape[0] + 1)), UNCODED, strip)
+    for point in range(centres.shape[0]):
+        if coded_share[point] < 0.0:
             continue
-        code_picture(grey, threshold, tangents, step, UNCODED, codes)
+        begin = point * spacing + 1
         coded = 0
-        for row in range(size):
+        for row in range(1, size + 1):
+            line = strip[row, begin : begin + size]
             for column in range(size):
-                code = codes[row + 1, column + 1]
-                templates[point, row, column] = code
-                coded += code != UNCODED
+                coded += 1 if line[column] != UNCODED else 0
         coded_share[point] = coded / (size * size)
