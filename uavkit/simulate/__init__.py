@@ -1,1 +1,1 @@
-"""Surveys of known truth; no stage imports this package."""
+"""Worlds of known truth, simulated flights over them, with their files and devices; no stage imports it."""
