@@ -16,9 +16,9 @@ from uavkit.core.progress import Progress, silent
 from uavkit.process.bundle_robust import (
     REJECTION_ROUNDS,
     RETURNING_ROUNDS,
+    CutRule,
     cut_weights,
-    huber_start,
-    normalised,
+    robust_start,
     same,
     tukey_solution,
     used_rays,
@@ -59,18 +59,18 @@ def adjust_block(
     state, weights = system.start(), system.full_weights()
     rounds = 0
     if options.robust:
-        state, weights = huber_start(system, state)
+        state, weights = robust_start(system, state)
         state, weights = tukey_solution(system, state, weights, options, progress)
-        precision = precision_at(system, state, weights)
-        weights = cut_weights(system, normalised(system, state, weights, precision), weights, options, True)
+        rule = CutRule(reject_above=options.reject_above, may_return=True)
+        weights = cut_weights(system, state, weights, precision_at(system, state, weights), rule)
     while True:
         state, iterations, converged = solve(system, state, weights, options)
         precision = precision_at(system, state, weights)
         rounds += 1
         if not options.robust or rounds >= REJECTION_ROUNDS:
             break
-        z = normalised(system, state, weights, precision)
-        next_weights = cut_weights(system, z, weights, options, rounds < RETURNING_ROUNDS)
+        rule = CutRule(reject_above=options.reject_above, may_return=rounds < RETURNING_ROUNDS)
+        next_weights = cut_weights(system, state, weights, precision, rule)
         if same(next_weights, weights):
             break
         weights = next_weights

@@ -1,4 +1,4 @@
-"""Robust weights and rejection in the bundle: Huber to start, Tukey's biweight, then a cut and full weights.
+"""Robust weights and rejection in the bundle: a start that gross errors cannot spoil, Tukey's biweight, then a cut.
 
 A ray is judged as a whole by the larger of its two |z|, a GNSS fix or control point by the largest of its three, with
 z = v / (s sigma sqrt(r)): r the redundancy number, s the robust scale of the group, which serves the weights only.
@@ -14,12 +14,14 @@ from uavkit.core.adjustment import AdjustmentOptions
 from uavkit.core.arrays import Array, Flags
 from uavkit.core.progress import Progress, silent
 from uavkit.process.bundle_system import (
+    Anchor,
     BundleSystem,
     Precision,
     State,
     Weights,
     gauss_newton_step,
     in_chunks,
+    local_leverage,
     misclosures,
     precision_at,
 )
@@ -30,99 +32,174 @@ WeightFunction = Callable[[Array], Array]
 
 LEAST_REDUNDANCY = 1e-3
 """Redundancy numbers below this say nothing; such residuals are divided by its root."""
-HUBER_STEPS = 20
-TUKEY_ROUNDS = 6
-REJECTION_ROUNDS = 12
-RETURNING_ROUNDS = 5
+TELLING_REDUNDANCY = 0.05
+"""Residuals of less redundancy do not count in the scale of their group."""
+START_STEPS = 40
+START_C = 6.0
+SHRINK = 2.0
+"""The scale of the start sinks at most by this factor a step, so that no image is locked out on the way."""
+ANCHOR = 0.5
+"""Sigma of the approximate orientations at the start, as a share of what the first misclosures amount to."""
+TUKEY_ROUNDS = 8
+REJECTION_ROUNDS = 14
+RETURNING_ROUNDS = 6
 """Rounds in which rejected observations may come back; later ones only reject, so that the rounds end."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Normalised:
-    """Largest |z| of each ray (k,), GNSS fix (g,) and control point (c,), before division by the group's scale."""
+    """v / (sigma sqrt(r)) of rays (k, 2), GNSS fixes (g, 3), control points (c, 3); the variances r, or 1 + h."""
 
-    rays: Array
-    gnss: Array
-    control: Array
-    scales: tuple[float, float, float]
+    z: tuple[Array, Array, Array]
+    variance: tuple[Array, Array, Array]
 
+    @property
+    def largest(self) -> tuple[Array, Array, Array]:
+        """Return the largest |z| of each ray, fix and control point; NaN where it cannot be told."""
+        rays, gnss, control = (np.max(np.abs(z), axis=1, initial=0.0) for z in self.z)
+        return rays, gnss, control
 
-def normalised(system: BundleSystem, state: State, weights: Weights, precision: Precision | None) -> Normalised:
-    """Return normalised residuals and the scale of each group; without precision all redundancy numbers count as 1."""
-    found, given = misclosures(system, state), system.given
-    groups = [(found.rays_px, system.rays.sigma_px, weights.rays)]
-    if given.gnss is not None:
-        groups.append((found.gnss_m, given.gnss.sigma_m, weights.gnss))
-    else:
-        groups.append((np.zeros((0, 3)), np.ones((0, 3)), np.zeros(0)))
-    if given.control is not None:
-        groups.append((found.control_m, given.control.sigma_m, weights.control))
-    else:
-        groups.append((np.zeros((0, 3)), np.ones((0, 3)), np.zeros(0)))
-    leverages: list[Array | None] = [None, None, None]
-    if precision is not None:
-        leverages = [precision.ray_leverage, precision.gnss_leverage, precision.control_leverage]
-    largest, scales = [], []
-    for (residual, sigma, weight), leverage in zip(groups, leverages, strict=True):
-        variance = np.ones_like(residual)
-        if leverage is not None:
-            # Of a linear estimate: 1 - h at full weight, 1 + h of an observation that took no part.
-            variance = np.maximum(1.0 + leverage * (1.0 - 2.0 * weight[:, None]), LEAST_REDUNDANCY)
-        z = residual / (sigma * np.sqrt(variance))
-        telling = z[variance > 0.05] if leverage is not None else z
+    def scale(self, group: int) -> float:
+        """Return the robust scale of a group: 0 rays, 1 GNSS, 2 control; drawn towards 1 in a small one."""
+        z, variance = self.z[group], self.variance[group]
+        telling = z[(variance > TELLING_REDUNDANCY) & np.isfinite(z)]
         redundancy = float(np.sum(np.minimum(variance, 1.0)[np.isfinite(z)]))
-        scales.append(shrunk_scale(trimmed_scale(telling, 5.0), redundancy) if telling.size else 1.0)
-        largest.append(np.max(np.abs(z), axis=1, initial=0.0))
-    return Normalised(rays=largest[0], gnss=largest[1], control=largest[2], scales=(scales[0], scales[1], scales[2]))
+        return shrunk_scale(trimmed_scale(telling, 5.0), redundancy) if telling.size else 1.0
+
+    @property
+    def scales(self) -> tuple[float, float, float]:
+        """Return the scales of rays, GNSS and control."""
+        return self.scale(0), self.scale(1), self.scale(2)
 
 
-def _weights(system: BundleSystem, z: Normalised, function: WeightFunction) -> Weights:
-    full = system.full_weights()
+def normalised(
+    system: BundleSystem, state: State, weights: Weights, leverages: tuple[Array, Array, Array]
+) -> Normalised:
+    """Return normalised residuals; ``leverages`` (variance of adjusted over observed) belong to ``weights``.
+
+    The variance of a residual is 1 - h at full weight and 1 + h of an observation that took no part.
+    """
+    found, given = misclosures(system, state), system.given
+    residuals = (found.rays_px, found.gnss_m, found.control_m)
+    sigmas = (
+        system.rays.sigma_px,
+        np.ones((0, 3)) if given.gnss is None else given.gnss.sigma_m,
+        np.ones((0, 3)) if given.control is None else given.control.sigma_m,
+    )
+    z, variances = [], []
+    for residual, sigma, leverage, weight, scale in zip(
+        residuals, sigmas, leverages, (weights.rays, weights.gnss, weights.control), weights.scales, strict=True
+    ):
+        squared = np.broadcast_to(np.asarray(scale) ** 2, weight.shape)[:, None]
+        variance = 1.0 + leverage / squared * (1.0 - 2.0 * squared * weight[:, None])
+        variances.append(np.maximum(variance, LEAST_REDUNDANCY))
+        z.append(residual / (sigma * np.sqrt(variances[-1])))
+    return Normalised(z=(z[0], z[1], z[2]), variance=(variances[0], variances[1], variances[2]))
+
+
+def _leverages(precision: Precision) -> tuple[Array, Array, Array]:
+    return precision.ray_leverage, precision.gnss_leverage, precision.control_leverage
+
+
+def _weighted(
+    system: BundleSystem,
+    found: Normalised,
+    scales: tuple[Array | float, float, float],
+    functions: tuple[WeightFunction, WeightFunction],
+) -> Weights:
+    """Return weight functions, of rays and of the rest, at the residuals over their scales."""
+    full, largest = system.full_weights(), found.largest
     parts = [
-        np.nan_to_num(function(values / scale), nan=0.0) * part
-        for values, scale, part in zip(
-            (z.rays, z.gnss, z.control), z.scales, (full.rays, full.gnss, full.control), strict=True
+        np.nan_to_num(function(values / scale), nan=0.0) * part / np.asarray(scale) ** 2
+        for function, values, scale, part in zip(
+            (functions[0], functions[1], functions[1]), largest, scales, (full.rays, full.gnss, full.control), strict=True
         )
     ]
-    return Weights(rays=parts[0], gnss=parts[1], control=parts[2])
+    return Weights(rays=parts[0], gnss=parts[1], control=parts[2], scales=scales)
 
 
-def reintersected(system: BundleSystem, state: State, scale: float) -> State:
+def reintersected(system: BundleSystem, state: State, scale: Array | float) -> State:
     """Return a state in which points with misclosures above 3 scales (in sigma) are intersected anew, robustly.
 
-    So neither a gross error nor a bad approximate point locks good rays out.
+    So neither a gross error nor a bad approximate point locks good rays out. The scale is one, or one for each ray.
     """
     z = np.max(np.abs(misclosures(system, state).rays_px / system.rays.sigma_px), axis=1)
     suspicious = np.zeros(len(state.points), dtype=np.bool_)
-    suspicious[system.point_of_ray[~(z <= 3.0 * scale)]] = True
+    suspicious[system.point_of_ray[~(z <= 3.0 * np.asarray(scale))]] = True
     suspicious |= ~np.isfinite(state.points[:, 0])
     if system.given.control is not None and system.uses_control:
         suspicious[system.given.control.point_index] = False
     points = state.points.copy()
+    typical = float(np.median(scale))
 
     def work(first: int, last: int) -> None:
-        intersect_robustly(system.rays, state.unknowns, suspicious, scale, first, last, points)
+        intersect_robustly(system.rays, state.unknowns, suspicious, typical, first, last, points)
 
     list(in_chunks(system, work))
     return replace(state, points=points)
 
 
-def huber_start(system: BundleSystem, state: State) -> tuple[State, Weights]:
-    """Return a first solution with Huber's weights, from approximate values that may be bad."""
-    weights, damping = system.full_weights(), 1e-3
-    z = normalised(system, state, weights, None)
-    state = reintersected(system, state, z.scales[0])
-    for number in range(HUBER_STEPS):
-        z = normalised(system, state, weights, None)
-        if number in (3, 7):
-            state = reintersected(system, state, z.scales[0])
-            z = normalised(system, state, weights, None)
-        weights = _weights(system, z, partial(huber_weight, k=1.345))
-        step = gauss_newton_step(system, state, weights, damping)
+def robust_start(system: BundleSystem, state: State) -> tuple[State, Weights]:
+    """Return a first solution from approximate values that may be bad, amid gross errors that may be many.
+
+    The approximate orientations count as observations; the scale, of each image its own, starts at the size of the first
+    misclosures and sinks step by step; points are intersected anew in each step. Redundancy numbers take orientations as
+    fixed here: what counts is that a ray of a point of few rays has a small residual whatever its error.
+    """
+    weights, damping = system.full_weights(), 1e-4
+    anchored, scales = system, np.zeros(0)
+    for number in range(START_STEPS):
+        leverages = local_leverage(system, state, weights)
+        found = normalised(system, state, weights, leverages)
+        scales = image_scales(system, found, scales)
+        by_ray = ray_scales(system, scales)
+        state = reintersected(system, state, by_ray)
+        if number == 0:
+            anchored = replace(system, anchor=_anchor(system, state, float(np.median(scales))))
+        found = normalised(system, state, weights, leverages)
+        _, gnss, control = found.scales
+        functions = partial(tukey_weight, c=START_C), partial(huber_weight, k=1.345)
+        weights = _weighted(system, found, (by_ray, gnss, control), functions)
+        step = gauss_newton_step(anchored, state, weights, damping)
         state, damping = step.state, step.damping
-        if number > 7 and step.size < 0.3:
+        if float(np.max(scales)) <= 1.5 and step.size < 3.0:
             break
     return state, weights
+
+
+def image_scales(system: BundleSystem, found: Normalised, before: Array) -> Array:
+    """Return the robust scale of each image's rays, (n,): at least 1, and not below half of what it was before."""
+    whole, z, telling = found.scale(0), found.z[0], found.variance[0] > TELLING_REDUNDANCY
+    telling &= np.isfinite(z)
+    result = np.full(len(system.given.projection_centres_m), whole)
+    order = np.argsort(system.rays.image, kind="stable")
+    bounds = np.searchsorted(system.rays.image[order], np.arange(len(result) + 1))
+    for image in range(len(result)):
+        rows = order[bounds[image] : bounds[image + 1]]
+        own = z[rows][telling[rows]]
+        if own.size >= 6:
+            result[image] = trimmed_scale(own, 5.0)
+    if before.size:
+        result = np.maximum(result, before / SHRINK)
+    return np.asarray(np.maximum(result, 1.0))
+
+
+def ray_scales(system: BundleSystem, scales: Array) -> Array:
+    """Return for each ray the largest scale of the images that see its point, (k,)."""
+    of_point = np.ones(len(system.rays.start) - 1)
+    np.maximum.at(of_point, system.point_of_ray, scales[system.rays.image])
+    return of_point[system.point_of_ray]
+
+
+def _anchor(system: BundleSystem, state: State, scale: float) -> Anchor:
+    """Return the approximate orientations as observations whose sigma suits first misclosures of this scale."""
+    sigma_px = ANCHOR * scale * float(np.median(system.rays.sigma_px))
+    c = float(state.interior[0])
+    distance = state.points[system.point_of_ray] - state.centres[system.rays.image]
+    distance_m = float(np.nanmedian(np.linalg.norm(distance, axis=1)))
+    return Anchor(
+        centres=state.centres, rotations=state.rotations, sigma_m=sigma_px / c * distance_m, sigma_rad=sigma_px / c
+    )
 
 
 def tukey_solution(
@@ -130,44 +207,50 @@ def tukey_solution(
 ) -> tuple[State, Weights]:
     """Return the solution with Tukey's weights, redundancy numbers and scales renewed in each round."""
     damping = 0.0
+    function = partial(tukey_weight, c=options.tukey_c)
     for number in range(TUKEY_ROUNDS):
         progress("bundle block adjustment: robust weights", number, TUKEY_ROUNDS)
-        precision = precision_at(system, state, weights)
-        z = normalised(system, state, weights, precision)
-        state = reintersected(system, state, z.scales[0])
-        z = normalised(system, state, weights, precision)
-        last, weights = weights, _weights(system, z, partial(tukey_weight, c=options.tukey_c))
+        leverages = _leverages(precision_at(system, state, weights))
+        state = reintersected(system, state, normalised(system, state, weights, leverages).scale(0))
+        found = normalised(system, state, weights, leverages)
+        last, weights = weights, _weighted(system, found, found.scales, (function, function))
         for _ in range(4):
             step = gauss_newton_step(system, state, weights, damping)
             state, damping = step.state, step.damping
             if step.size < 0.1:
                 break
-        if number > 1 and float(np.max(np.abs(weights.rays - last.rays), initial=0.0)) < 0.02:
+        if number > 1 and float(np.max(np.abs(weights.rays - last.rays), initial=0.0)) < 0.05:
             break
     return state, weights
 
 
 def cut_weights(
-    system: BundleSystem, z: Normalised, weights: Weights, options: AdjustmentOptions, may_return: bool
+    system: BundleSystem, state: State, weights: Weights, precision: Precision, rule: "CutRule"
 ) -> Weights:
-    """Return weights of 1 within and 0 beyond ``reject_above``; of a point's used rays only the worst goes at once."""
-    full = system.full_weights()
-    inside = z.rays / z.scales[0] <= options.reject_above
-    used = weights.rays > 0.0
+    """Return weights of 1 within and 0 beyond the cut; of a point's used rays only the worst goes at once."""
+    found = normalised(system, state, weights, _leverages(precision))
+    rays, gnss, control = (values / scale for values, scale in zip(found.largest, found.scales, strict=True))
+    full, used = system.full_weights(), weights.rays > 0.0
+    inside = rays <= rule.reject_above
     worst = np.zeros(len(system.rays.start) - 1)
-    magnitude = np.where(used, np.nan_to_num(z.rays, nan=np.inf), 0.0)
+    magnitude = np.where(used, np.nan_to_num(rays, nan=np.inf), 0.0)
     np.maximum.at(worst, system.point_of_ray, magnitude)
     keep = used & (inside | (magnitude < worst[system.point_of_ray]))
-    if may_return:
+    if rule.may_return:
         keep |= inside
-    rest = [
-        ((values / scale <= options.reject_above) & (may_return | (before > 0.0))) * part
-        for values, scale, before, part in (
-            (z.gnss, z.scales[1], weights.gnss, full.gnss),
-            (z.control, z.scales[2], weights.control, full.control),
-        )
-    ]
-    return Weights(rays=keep.astype(np.float64), gnss=rest[0], control=rest[1])
+    return Weights(
+        rays=keep.astype(np.float64),
+        gnss=full.gnss * (gnss <= rule.reject_above) * (rule.may_return | (weights.gnss > 0.0)),
+        control=full.control * (control <= rule.reject_above) * (rule.may_return | (weights.control > 0.0)),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CutRule:
+    """Beyond which |z| an observation is left out, and whether those left out may come back."""
+
+    reject_above: float
+    may_return: bool
 
 
 def same(a: Weights, b: Weights) -> bool:

@@ -52,11 +52,13 @@ class State:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Weights:
-    """Robust weights, 0 to 1, of rays (k,), GNSS fixes (g,) and control points (c,)."""
+    """Weights of rays (k,), GNSS fixes (g,) and control points (c,): robust weight, 0 to 1, over scale squared."""
 
     rays: Array
     gnss: Array
     control: Array
+    scales: tuple[Array | float, float, float] = (1.0, 1.0, 1.0)
+    """Factors to the stated sigmas that the weights contain: of rays (one, or (k,)), GNSS and control."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +68,27 @@ class Misclosures:
     rays_px: Array
     gnss_m: Array
     control_m: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Anchor:
+    """Approximate orientations as observations: they hold a robust start while gross errors are still at large."""
+
+    centres: Array
+    rotations: Array
+    sigma_m: float
+    sigma_rad: float
+
+    def misclosures(self, state: State) -> Array:
+        """Return observed minus computed over sigma, (n, 6); rotations by the sine of their difference."""
+        turn = state.rotations.transpose(0, 2, 1) @ self.rotations
+        skewed = 0.5 * (turn - turn.transpose(0, 2, 1))
+        vector = np.stack([skewed[:, 2, 1], skewed[:, 0, 2], skewed[:, 1, 0]], axis=1)
+        return np.concatenate([(self.centres - state.centres) / self.sigma_m, vector / self.sigma_rad], axis=1)
+
+    def information(self) -> Array:
+        """Return the weights (6,) of an image's six unknowns."""
+        return np.repeat([self.sigma_m**-2.0, self.sigma_rad**-2.0], 3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,6 +110,7 @@ class BundleSystem:
     shift_sigma_m: Array
     """(flights, 3) a priori sigma; infinite where free."""
     factorise: Factoriser = factor_dense
+    anchor: Anchor | None = None
 
     @property
     def border(self) -> int:
@@ -211,6 +235,8 @@ def cost(system: BundleSystem, state: State, weights: Weights, determined: Flags
     if system.given.control is not None:
         total += float(np.sum(weights.control[:, None] * (found.control_m / system.given.control.sigma_m) ** 2))
     total += float(np.sum(((state.interior[system.free] - system.prior) / system.prior_sigma) ** 2))
+    if system.anchor is not None:
+        total += float(np.sum(system.anchor.misclosures(state) ** 2))
     return total + float(np.sum((state.shifts / system.shift_sigma_m) ** 2))
 
 
@@ -262,6 +288,11 @@ def _add_priors(system: BundleSystem, state: State, reduced: Reduced) -> None:
     reduced.corner[np.diag_indices_from(reduced.corner)] += sigma**-2.0
     reduced.diagonal_border[:] += sigma**-2.0
     reduced.right_border[:] -= value * sigma**-2.0
+    if system.anchor is not None:
+        information = system.anchor.information()
+        reduced.blocks[system.pattern.diagonal] += np.diag(information)
+        reduced.diagonal_images[:] += information
+        reduced.right_images[:] += np.sqrt(information) * system.anchor.misclosures(state)
 
 
 def reduced_normals(system: BundleSystem, state: State, weights: Weights, damping: float) -> tuple[Reduced, Flags]:
@@ -392,6 +423,8 @@ def _direct_product(system: BundleSystem, state: State, weights: Weights, images
     sigma = np.concatenate([system.prior_sigma, system.shift_sigma_m.ravel()])
     value = np.concatenate([state.interior[system.free] - system.prior, state.shifts.ravel()])
     total = -float(np.sum(border * value * sigma**-2.0))
+    if system.anchor is not None:
+        total += float(np.sum(images * np.sqrt(system.anchor.information()) * system.anchor.misclosures(state)))
     if system.uses_gnss and system.given.gnss is not None:
         gnss = system.given.gnss
         moved = np.einsum("gak,gk->ga", gnss_design(system, state), images[gnss.image_index])
@@ -447,6 +480,25 @@ def precision_at(system: BundleSystem, state: State, weights: Weights) -> Precis
         gnss_leverage=_gnss_leverage(system, state, inverse),
         control_leverage=_control_leverage(system, covariances),
     )
+
+
+def local_leverage(system: BundleSystem, state: State, weights: Weights) -> tuple[Array, Array, Array]:
+    """Return leverages of rays, GNSS fixes and control points as if the orientations were known exactly."""
+    n, b, pairs = len(state.centres), system.border, len(system.pattern.column)
+    none = Inverse(
+        system.pattern.row_start, system.pattern.column, np.zeros((pairs, 6, 6)), np.zeros((n, 6, b)), np.zeros((b, b))
+    )
+    coordinates = control_coordinates(system, state, weights)
+    covariances, leverage = np.empty((len(state.points), 3, 3)), np.empty((len(system.order), 2))
+
+    def work(first: int, last: int) -> None:
+        point_precision(
+            system.rays, state.unknowns, weights.rays, system.free, coordinates, first, last, none, covariances, leverage
+        )
+
+    list(in_chunks(system, work))
+    gnss = 0 if system.given.gnss is None else len(system.given.gnss)
+    return leverage, np.zeros((gnss, 3)), np.nan_to_num(_control_leverage(system, covariances))
 
 
 def _gnss_leverage(system: BundleSystem, state: State, inverse: Inverse) -> Array:
