@@ -86,6 +86,24 @@ def test_a_missing_index_costs_no_frame(avi: Path, tmp_path: Path) -> None:
     assert "index is missing" in " ".join(source.damage())
 
 
+@pytest.mark.parametrize("start", [0.3, 0.55, 0.8])
+def test_seeking_beyond_a_hole_gives_the_same_frames(avi: Path, tmp_path: Path, start: float) -> None:
+    content = bytearray(avi.read_bytes())
+    place = int(len(content) * start)
+    content[place : place + 6000] = bytes(6000)
+    hole = tmp_path / "hole.avi"
+    hole.write_bytes(content)
+    source = FileVideoSource(hole)
+    whole = {frame.index: frame for frame in source.frames()}
+    part = list(source.frames(30, 35))
+    assert len(whole) < 40
+    assert part
+    for frame in part:
+        assert np.array_equal(frame.luminance, whole[frame.index].luminance)
+        assert frame.time_ns == whole[frame.index].time_ns
+    assert source.damage()
+
+
 def test_a_destroyed_frame_leaves_the_other_indexes_right(tmp_path: Path) -> None:
     path = write_video(tmp_path / "flight.avi", 40, codec="mjpeg")
     content = bytearray(path.read_bytes())

@@ -45,6 +45,10 @@ class _PacketIndex:
     pts: tuple[int, ...]
     """In the order of display; empty where packets tell none or not one each."""
     key_pts: tuple[int, ...]
+    pts_at: dict[int, int]
+    """Presentation time by place in the file, as reading from the start tells it."""
+    dropped: int
+    """Packets without content, by which AVI records that a frame was dropped."""
 
 
 class FileVideoSource:
@@ -62,10 +66,13 @@ class FileVideoSource:
             raise InputError(
                 f"{self._path}: the video holds no frame that can be read: copy it again from the recorder"
             )
-        for note in _avi_damage(self._path):
+        cut = _avi_damage(self._path)
+        for note in cut:
             self._note(note)
-        if promised > self._index.count:
-            self._note(f"the header promises {promised} frames, the file holds {self._index.count}: the end is missing")
+        if promised > self._index.count + self._index.dropped:
+            where = "some before the end, later frames seem earlier than they were"
+            where = "those at the end" if cut or self._path.suffix.lower() != ".avi" else where
+            self._note(f"the header promises {promised} frames, the file holds {self._index.count}; missing: {where}")
         self._info = self._read_info()
 
     def info(self) -> VideoInfo:
@@ -103,7 +110,7 @@ class FileVideoSource:
                 self._note(f"frame {index} is damaged")
             yield VideoFrame(
                 index=index,
-                time_ns=self._time_ns(index, frame.pts),
+                time_ns=self._time_ns(index),
                 luminance=luminance(frame),
                 damaged=bool(frame.is_corrupt),
             )
@@ -136,41 +143,48 @@ class FileVideoSource:
             stream = _video_stream(container, self._path)
             if seek_pts is not None:
                 container.seek(seek_pts, stream=stream, backward=True)
-            for frame in self._frames_of(container, stream, after=counter):
+            for pts, frame in self._frames_of(container, stream):
                 if seek_pts is not None:
-                    index = lookup.get(frame.pts, -1) if frame.pts is not None and frame.pts >= seek_pts else -1
+                    index = lookup.get(pts, -1) if pts is not None and pts >= seek_pts else -1
                 else:
-                    told = counter + 1 if frame.pts is None else lookup.get(frame.pts, counter + 1)
-                    counter = max(told, counter + 1)
-                    index = counter
+                    told = counter + 1 if pts is None else lookup.get(pts, counter + 1)
+                    counter = index = max(told, counter + 1)
                 yield index, frame
 
-    def _frames_of(self, container: "InputContainer", stream: "VideoStream", after: int) -> Iterator["av.VideoFrame"]:
+    def _frames_of(
+        self, container: "InputContainer", stream: "VideoStream"
+    ) -> Iterator[tuple[int | None, "av.VideoFrame"]]:
+        """Yield (presentation time, frame) of what can be decoded.
+
+        Where an AVI has lost chunks, times after a seek (from its index) differ from those of reading from the start
+        (which counts chunks): the place of each packet in the file ties the former to the latter.
+        """
         from av.error import FFmpegError
 
-        read = after
+        shift = 0
         try:
             for packet in container.demux(stream):
                 if packet.size == 0 and packet.pts is not None:
                     continue  # a dropped frame of AVI: an empty packet would end the decoder
+                if packet.pts is not None and packet.pos is not None:
+                    shift = self._index.pts_at.get(packet.pos, packet.pts + shift) - packet.pts
                 try:
                     for frame in packet.decode():
-                        read += 1
-                        yield frame
+                        yield (None if frame.pts is None else frame.pts + shift), frame
                 except FFmpegError:
-                    self._note(f"a frame near {max(read + 1, 0)} cannot be decoded ({self._moment(packet)})")
+                    self._note(f"a frame cannot be decoded: {self._moment(packet)}")
         except FFmpegError as error:
-            self._note(f"reading ends after frame {read}: {error.strerror or error}")
+            self._note(f"reading ends early: {error.strerror or error}")
 
     def _moment(self, packet: Any) -> str:
         if packet.pts is None or packet.time_base is None:
-            return "its time is unknown"
-        return f"at {float(packet.pts * packet.time_base):.2f} s"
+            return "nothing tells which one"
+        return f"the one at {float(packet.pts * packet.time_base):.2f} s"
 
-    def _time_ns(self, index: int, pts: int | None) -> int:
-        if pts is None or not self._index.pts:
+    def _time_ns(self, index: int) -> int:
+        if index >= len(self._index.pts):
             return index * self._info.frame_interval_ns
-        ticks = pts - self._index.pts[0]
+        ticks = self._index.pts[index] - self._index.pts[0]
         return round(ticks * self._time_base.numerator * 1_000_000_000 / self._time_base.denominator)
 
     def _read_index(self, container: "InputContainer", stream: "VideoStream") -> _PacketIndex:
@@ -180,19 +194,22 @@ class FileVideoSource:
         if stream.time_base is None:
             raise InputError(f"{self._path}: the video has no time base: convert it to AVI, MKV or MP4 anew")
         self._time_base = stream.time_base
-        count, times, keys = 0, [], []
+        count, dropped, times, keys, places = 0, 0, [], [], {}
         try:
             for packet in container.demux(stream):
                 if packet.size == 0:
+                    dropped += packet.pts is not None
                     continue
                 count += 1
                 if packet.pts is not None:
                     times.append(packet.pts)
+                    places.update({packet.pos: packet.pts} if packet.pos is not None else {})
                     keys += [packet.pts] if packet.is_keyframe else []
         except FFmpegError as error:
             self._note(f"reading ends after packet {count}: {error.strerror or error}")
-        complete = len(set(times)) == count
-        return _PacketIndex(count, tuple(sorted(times)) if complete else (), tuple(sorted(keys)) if complete else ())
+        if len(set(times)) != count:
+            times, keys, places = [], [], {}
+        return _PacketIndex(count, tuple(sorted(times)), tuple(sorted(keys)), places, dropped)
 
     def _read_info(self) -> VideoInfo:
         head = next((frame for _, frame in self._decode(seek_pts=None)), None)
@@ -229,7 +246,7 @@ class FileVideoSource:
         if self._path.stat().st_size == 0:
             raise InputError(f"{self._path}: the file is empty (0 bytes): copy it again from the recorder")
         try:
-            container = av.open(str(self._path))
+            container = av.open(str(self._path), metadata_errors="ignore")
         except FFmpegError as error:
             raise InputError(
                 f"{self._path}: no video that can be read ({error.strerror or error}): give an AVI, MKV or MP4 file"
