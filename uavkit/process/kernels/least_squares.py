@@ -34,6 +34,8 @@ class Workspace(NamedTuple):
     """Part of a picture as floats; only its first rows and columns may be in use."""
     frame: NDArray[np.int64]
     """Left column, top row, columns and rows of that part."""
+    lines: Floats
+    """Rows of the reference window, interpolated along the rows only."""
     large: Floats
     patch: Floats
     columns: Floats
@@ -63,6 +65,7 @@ def workspace(size: int, buffer_side: int) -> Workspace:
     return Workspace(
         buffer=np.zeros((buffer_side, buffer_side), np.float32),
         frame=np.zeros(4, np.int64),
+        lines=np.zeros((size + 5, size + 2), np.float32),
         large=np.zeros((size + 2, size + 2), np.float32),
         patch=np.zeros((size, size), np.float32),
         columns=np.zeros((UNKNOWNS, size * size), np.float32),
@@ -94,9 +97,9 @@ def _take_part(image: NDArray[np.uint8], centre: Doubles, reach_x: float, reach_
         return False
     work.frame[0], work.frame[1], work.frame[2], work.frame[3] = left, top, right - left, bottom - top
     for row in range(bottom - top):
-        line, source = work.buffer[row], image[top + row]
+        line, source = work.buffer[row, : right - left], image[top + row, left:right]
         for column in range(right - left):
-            line[column] = np.float32(source[left + column])
+            line[column] = np.float32(source[column])
     return True
 
 
@@ -138,6 +141,32 @@ def _resample_cubic(
             patch[row, column] = (h[0] * first + h[1] * second) + (h[2] * third + h[3] * last)
             x += step_x
             y += step_y
+
+
+@kernel
+def _resample_shifted(
+    buffer: Floats, frame: NDArray[np.int64], centre: Doubles, table: Floats, lines: Floats, patch: Floats
+) -> None:
+    """Bicubic grey values about a centre without any deformation: first along the rows, then along the columns."""
+    rows, size = lines.shape
+    half = size // 2
+    bits = 16 - FRACTION_BITS
+    x = np.int64(np.floor((centre[0] - frame[0]) * 65536.0)) + (1 << (bits - 1))
+    y = np.int64(np.floor((centre[1] - frame[1]) * 65536.0)) + (1 << (bits - 1))
+    at_x, at_y = (x & 65535) >> bits, (y & 65535) >> bits
+    h0, h1, h2, h3 = table[at_x, 0], table[at_x, 1], table[at_x, 2], table[at_x, 3]
+    v0, v1, v2, v3 = table[at_y, 0], table[at_y, 1], table[at_y, 2], table[at_y, 3]
+    left, top = (x >> 16) - half - 1, (y >> 16) - half - 1
+    for row in range(rows):
+        source, line = buffer[top + row, left : left + size + 3], lines[row]
+        for column in range(size):
+            first = h0 * source[column] + h1 * source[column + 1]
+            line[column] = first + (h2 * source[column + 2] + h3 * source[column + 3])
+    for row in range(size):
+        a, b, c, d = lines[row], lines[row + 1], lines[row + 2], lines[row + 3]
+        line = patch[row]
+        for column in range(size):
+            line[column] = (v0 * a[column] + v1 * b[column]) + (v2 * c[column] + v3 * d[column])
 
 
 @kernel
@@ -251,7 +280,7 @@ def _prepare_reference(
     reach = reach_of_window(unit, size + 2, 0)
     if not _take_part(reference, centre, reach, reach, work) or not _inside(centre, unit, size + 2, work.frame):
         return LEFT_IMAGE
-    _resample_cubic(work.buffer, work.frame, centre, unit, table, work.large)
+    _resample_shifted(work.buffer, work.frame, centre, table, work.lines, work.large)
     _design(work.large, weights, work.columns, work.weighted)
     normal = work.normal
     for i in range(UNKNOWNS):
