@@ -176,20 +176,21 @@ def camera_from_exif(still: StillInfo) -> CameraProfile:
 
 
 def interior_for_size(profile: CameraProfile, width_px: int, height_px: int) -> CameraProfile:
-    """Return the profile for stills of another size: resampled where the shape is the same, else cropped and resampled.
+    """Return the profile for stills of another size: resampled where the shape is the same, else cropped.
 
-    Cameras crop 4:3 to 16:9 or 3:2 in height and keep the width, or the other way: the direction that keeps the larger
-    scale is taken, with the crop in the middle.
+    Cameras crop about the middle and keep the width (4:3 to 16:9 or 3:2) or the height (3:2 to 4:3): where one of them
+    is the profile's own the scale stays, else the larger of both ratios counts.
     """
     known = profile.interior
-    scale = max(width_px / known.width_px, height_px / known.height_px)
-    whole = known.scaled(max(width_px, round(known.width_px * scale)), max(height_px, round(known.height_px * scale)))
+    ratios = (width_px / known.width_px, height_px / known.height_px)
+    scale = 1.0 if 1.0 in ratios else max(ratios)
     cropped = replace(
-        whole,
+        known,
         width_px=width_px,
         height_px=height_px,
-        x0_px=whole.x0_px - (whole.width_px - width_px) / 2,
-        y0_px=whole.y0_px - (whole.height_px - height_px) / 2,
+        principal_distance_px=known.principal_distance_px * scale,
+        x0_px=(known.x0_px + 0.5) * scale - 0.5 - (known.width_px * scale - width_px) / 2,
+        y0_px=(known.y0_px + 0.5) * scale - 0.5 - (known.height_px * scale - height_px) / 2,
     )
     sigmas = profile.interior_sigmas
     return replace(
