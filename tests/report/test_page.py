@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from uavkit.core.adjustment import Datum
-from uavkit.core.errors import InputError
+from uavkit.core.errors import AdjustmentError, InputError
 from uavkit.core.result import OrientedBlock, PointDifference
 from uavkit.report.page import write_report
 from uavkit.report.tables import PaperComparison
@@ -283,6 +283,27 @@ def test_an_earlier_figure_does_not_stay(result: OrientedBlock, tmp_path: Path) 
     write_report(bare(result), tmp_path)
     assert not (tmp_path / "figures" / "matches.png").exists()
     assert not list(tmp_path.rglob(".*"))
+
+
+def test_nothing_oriented_is_no_result(result: OrientedBlock, tmp_path: Path) -> None:
+    with pytest.raises(AdjustmentError, match="nothing to report"):
+        write_report(replace(result, images=()), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_points_without_covariances_and_unknown_names(result: OrientedBlock, tmp_path: Path) -> None:
+    adjustment = replace(
+        result.adjustment,
+        point_covariances_m2=np.zeros((0, 3, 3)),
+        gnss_used=result.adjustment.gnss_used[:5],
+        gnss_residuals_m=result.adjustment.gnss_residuals_m[:5],
+    )
+    check = tuple(replace(point, name=f"other {point.name}", sigma_m=(0.0, 0.0, 0.0)) for point in result.check)
+    poor = replace(result, adjustment=adjustment, check=check, check_covariance_m2=np.zeros((33, 33)))
+    page = read(write_report(poor, tmp_path))
+    assert page.table("Sigma of", "Number")[0] == ["Object points XY [mm]", "0", "–", "–", "–", "–"]
+    assert page.table("Still", "Residual E [m]")[0][0] == "fix 5"
+    assert page.table("Point", "dE [mm]")[0][7:10] == ["–", "–", "–"]
 
 
 def test_progress_goes_from_nothing_to_all(result: OrientedBlock, tmp_path: Path) -> None:

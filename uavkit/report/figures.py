@@ -223,9 +223,10 @@ def ray_count_histogram(result: OrientedBlock) -> Drawing:
     if not len(rays):
         return Drawing(name=name, title=title, caption="", absent="No object point is determined.")
     top = max(int(np.percentile(rays, 99.5)), 4)
-    width = -(-(top - 1) // MOST_BARS)
-    edges = np.arange(2, top + width + 1, width)
-    counts, _ = np.histogram(np.clip(rays, 2, edges[-1] - 1), np.append(edges[:-1], edges[-1]) - 0.5)
+    first = int(rays.min())
+    width = -(-(top - first + 1) // MOST_BARS)
+    edges = np.arange(first, top + width + 1, width)
+    counts, _ = np.histogram(np.minimum(rays, edges[-1] - 1), edges - 0.5)
     figure = new_figure(2.6)
     axes = figure.add_subplot()
     bars = axes.bar(edges[:-1] + 0.5 * (width - 1), counts, color=BLUE, width=0.8 * width)
@@ -233,7 +234,7 @@ def ray_count_histogram(result: OrientedBlock) -> Drawing:
         axes.bar_label(bars, fontsize=7.5, padding=1.5, color=INK)
     plain_axes(axes, "Rays used", "Points")
     axes.grid(False, axis="x")
-    axes.set_xlim(2 - 0.8 * width, edges[-1] - 0.2 * width)
+    axes.set_xlim(first - 0.8 * width, edges[-1] - 0.2 * width)
     axes.locator_params(axis="x", integer=True)
     if np.any(rays >= edges[-1]):
         axes.set_xlabel(f"Rays used (last bar: {edges[-2]} and more)")

@@ -68,7 +68,7 @@ def residual_vectors(result: OrientedBlock) -> Drawing:
     axes.plot(interior.x0_px, interior.y0_px, "+", color=INK, ms=9)
     key = round_number(arrow_px)
     axes.set_title(" ")  # keeps room for the key
-    axes.quiverkey(arrows, 0.86, 1.04, key, f"{key:g} px", labelpos="E", coordinates="axes", color=INK)
+    axes.quiverkey(arrows, 0.86, 1.022, key, f"{key:g} px", labelpos="E", coordinates="axes", color=INK)
     axes.set(xlim=(-0.5, interior.width_px - 0.5), ylim=(interior.height_px - 0.5, -0.5), aspect="equal")
     plain_axes(axes, "Column [px]", "Row [px]")
     residuals = result.adjustment.ray_residuals_px[used]

@@ -7,6 +7,7 @@ from html import escape
 from pathlib import Path
 
 from uavkit.core.adjustment import Datum
+from uavkit.core.errors import AdjustmentError
 from uavkit.core.progress import Progress, silent
 from uavkit.core.result import OrientedBlock
 from uavkit.formats.atomic import atomic_path, write_text
@@ -17,6 +18,8 @@ from uavkit.report.tables import PaperComparison, Table, number, thousandths
 from uavkit.report.verdict import Remark, Weight, remarks, sigma0_sentence
 
 PAGE_NAME = "report.html"
+SHORT_TABLE = 16
+"""Tables up to so many rows are not parted between two printed pages."""
 DATUM_TEXTS = {
     Datum.CONTROL: "ground control points",
     Datum.GNSS: "GNSS positions",
@@ -60,7 +63,7 @@ tbody th { font-weight: 400; }
 details { margin: 1rem 0; } summary { cursor: pointer; font-weight: 600; padding: .2rem 0; }
 @page { margin: 16mm 14mm; }
 @media print { body { padding: 0; font-size: 10pt; max-width: none; } h2, h3 { break-after: avoid; }
-  tr, .verdict, .key { break-inside: avoid; } .scroll { overflow: visible; } thead { display: table-header-group; }
+  tr, .verdict, .key, .short { break-inside: avoid; } .scroll { overflow: visible; } thead { display: table-header-group; }
   details::details-content { content-visibility: visible; block-size: auto; } .wide table { font-size: 6.4pt; }
   .weight, .key, h2, .verdict { print-color-adjust: exact; -webkit-print-color-adjust: exact; } }
 """
@@ -313,6 +316,7 @@ def table_html(table: Table) -> str:
         for row in table.rows
     )
     wide = " wide" if len(table.header) > 12 else ""
+    wide += " short" if len(table.rows) <= SHORT_TABLE else ""
     note = f'<p class="note">{escape(table.note)}</p>' if table.note else ""
     inner = (
         f'<div class="scroll{wide}"><table><thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table></div>{note}'
