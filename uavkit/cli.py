@@ -1,0 +1,370 @@
+"""The command line: a command for each stage. It draws progress, words results, and turns errors into one line."""
+
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+from typer.core import TyperGroup
+
+from uavkit import __version__
+from uavkit.core.errors import UavkitError
+
+if TYPE_CHECKING:
+    from uavkit.core.block import Block
+    from uavkit.core.progress import Progress
+    from uavkit.core.result import OrientedBlock
+    from uavkit.project import Project
+
+EXIT_ERROR = 2
+EXIT_DEFECT = 1
+EXIT_INTERRUPTED = 130
+INTERRUPTED = "interrupted; run the same command again to go on"
+LINES_EVERY_S = 5.0
+"""Progress that does not go to a terminal: a line at the start and end of each step, and this often in between."""
+
+
+def _debug_wanted() -> bool:
+    return os.environ.get("UAVKIT_DEBUG", "") not in ("", "0")
+
+
+class _Commands(TyperGroup):
+    """The commands; whatever goes wrong inside one ends as one line on stderr and an exit status."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            _end(INTERRUPTED, EXIT_INTERRUPTED)
+        except UavkitError as error:
+            _end(str(error), EXIT_ERROR)
+        except MemoryError:
+            _end("the memory does not suffice: close other programs, or give fewer --workers", EXIT_ERROR)
+        except (typer.Exit, typer.Abort, typer.BadParameter):
+            raise
+        except Exception as error:
+            if hasattr(error, "exit_code"):  # a usage error; typer words it and exits with status 2
+                raise
+            what = f"{type(error).__name__}: {error}"
+            _end(f"unexpected error ({what}): this is a defect of uavkit; --debug shows where", EXIT_DEFECT)
+
+
+def _end(message: str, status: int) -> None:
+    """Leave with a line on stderr and an exit status, with a traceback before it where the user wants to see it."""
+    if _debug_wanted():
+        import traceback
+
+        traceback.print_exc()
+    typer.echo(f"uavkit: {' '.join(message.split())}", err=True)
+    raise SystemExit(status) from None
+
+
+app = typer.Typer(
+    cls=_Commands,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Photogrammetric surveys with low-cost drones. Try it: uavkit demo OUT. Usual order: ingest, process, report; "
+    "'run' does whatever is out of date.",
+)
+
+Survey = Annotated[Path, typer.Argument(help="Folder of the survey.", show_default=False)]
+Workers = Annotated[int, typer.Option(min=1, max=1024, help="Threads; the result does not depend on it.")]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="SECTION.OPTION=VALUE", help="An option of the processing core; may be repeated."),
+]
+CORES = os.cpu_count() or 1
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"uavkit {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Tell it.")] = False,  # noqa: ARG001
+) -> None:
+    """Take the options that all commands have."""
+    if debug:
+        os.environ["UAVKIT_DEBUG"] = "1"
+
+
+@app.command()
+def simulate(
+    out: Annotated[Path, typer.Argument(help="New folder for the simulated flight.", show_default=False)],
+    flight: Annotated[
+        Literal["constant", "trace"], typer.Option(help="One height, or following the ground.")
+    ] = "constant",
+    scale: Annotated[float, typer.Option(help="Size of the stills against 4000 x 3000, 0.1 to 1.")] = 1.0,
+    strips: Annotated[int, typer.Option(help="Strips, 1 to 5.")] = 3,
+    stations: Annotated[int, typer.Option(help="Stills in each strip, 2 to 13.")] = 11,
+    video: Annotated[Literal["ntsc", "pal", "none"], typer.Option(help="Standard of the finder's video.")] = "ntsc",
+    seed: Annotated[int, typer.Option(help="Of everything that is random.")] = 1,
+    workers: Workers = CORES,
+) -> None:
+    """Simulate a flight over an embankment: stills, video, positions, control and check points, and the truth."""
+    from uavkit import workflow
+
+    with progress_shown() as progress:
+        made = workflow.simulate(
+            out,
+            {
+                "flight": flight,
+                "scale": scale,
+                "strips": strips,
+                "stations_per_strip": stations,
+                "video_standard": video,
+                "seed": seed,
+                "workers": workers,
+            },
+            progress,
+        )
+    typer.echo(f"Simulated {strips} strips of {stations} stills: {out}")
+    typer.echo(f"Go on with: {made}")
+
+
+@app.command()
+def ingest(
+    survey: Survey,
+    images: Annotated[Path, typer.Option(help="Folder of the stills.", show_default=False)],
+    camera: Annotated[
+        str, typer.Option(help="A name that 'uavkit cameras' lists, or a camera file.", show_default=False)
+    ],
+    video: Annotated[Path | None, typer.Option(help="Video of the finder.")] = None,
+    positions: Annotated[Path | None, typer.Option(help="KML or KMZ with the exposure positions.")] = None,
+    control_points: Annotated[Path | None, typer.Option(help="Ground control points with their marks.")] = None,
+    check_points: Annotated[Path | None, typer.Option(help="Check points with their marks, held back.")] = None,
+    height_datum: Annotated[
+        Literal["ellipsoid", "geoid", "unknown"], typer.Option(help="What the heights of the positions count from.")
+    ] = "unknown",
+    crs: Annotated[str, typer.Option(help="EPSG code of the results; else that of the control file, else UTM.")] = "",
+    pixel_origin: Annotated[
+        Literal["centre", "corner"] | None,
+        typer.Option(help="What (0, 0) is in the marks: centre or corner of the first pixel; else as the file says."),
+    ] = None,
+) -> None:
+    """Bring stills, video, positions and control together into a block. The originals stay where they are."""
+    from uavkit import workflow
+    from uavkit.project import IngestOptions, Project
+
+    originals = {
+        "images": images,
+        "video": video,
+        "positions": positions,
+        "control_points": control_points,
+        "check_points": check_points,
+    }
+    options = IngestOptions(camera=camera, height_datum=height_datum, crs=crs, pixel_origin=pixel_origin or "")
+    project = Project(survey)
+    with project.locked(), progress_shown() as progress:
+        workflow.begin_survey(project, {role: path for role, path in originals.items() if path is not None}, options)
+        block = workflow.ingest(project, progress)
+    _say(block_summary(block))
+    typer.echo(f"Block: {project.block_file}\nNext: uavkit process {survey}")
+
+
+@app.command()
+def process(survey: Survey, workers: Workers = CORES, settings: Settings = None) -> None:
+    """Orient the stills: pass points, tie points, bundle block adjustment with its precision."""
+    from uavkit import workflow
+    from uavkit.project import Project
+
+    project = Project(survey)
+    with project.locked(), progress_shown() as progress:
+        workflow.choose_settings(project, settings or [])
+        oriented = workflow.process(project, workers, progress)
+    _say(oriented_summary(oriented))
+    typer.echo(f"Result: {project.result_file}\nNext: uavkit report {survey}")
+
+
+@app.command()
+def report(survey: Survey) -> None:
+    """Write the report: one HTML file that needs nothing beside it."""
+    from uavkit import workflow
+    from uavkit.project import Project
+
+    project = Project(survey)
+    with project.locked(), progress_shown() as progress:
+        page = workflow.report(project, progress)
+    typer.echo(f"Report: {page}")
+
+
+@app.command()
+def run(survey: Survey, workers: Workers = CORES) -> None:
+    """Do all stages that are out of date, with the options that the survey has."""
+    from uavkit import workflow
+    from uavkit.project import Project
+
+    project = Project(survey)
+    with project.locked(), progress_shown() as progress:
+        done = workflow.run(project, workers, progress)
+    _finish(project, done)
+
+
+def _finish(project: "Project", done: list[str]) -> None:
+    from uavkit import workflow
+
+    typer.echo(f"Done: {', '.join(done)}" if done else "Nothing was out of date.")
+    _say(oriented_summary(workflow.oriented_block(project)))
+    typer.echo(f"Report: {workflow.report_page(project)}")
+
+
+@app.command()
+def status(survey: Survey) -> None:
+    """Tell where a survey stands."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from uavkit.project import Project
+
+    table = Table(box=None, pad_edge=False)
+    for heading in ("stage", "standing", "why"):
+        table.add_column(heading)
+    for entry in Project(survey).status():
+        table.add_row(entry.stage.value, entry.standing.value, entry.why)
+    Console(highlight=False).print(table)
+
+
+@app.command()
+def export(
+    survey: Survey,
+    to: Annotated[Literal["colmap", "ply", "las", "laz"], typer.Option(help="Format.", show_default=False)],
+    out: Annotated[Path | None, typer.Option(help="Folder to write to; else 'export' in the survey.")] = None,
+) -> None:
+    """Write the oriented block for other programs: a COLMAP model, or a point cloud."""
+    from uavkit import workflow
+    from uavkit.project import Project
+
+    project = Project(survey)
+    for path in workflow.export(project, to, out or project.folder / "export"):
+        typer.echo(str(path))
+
+
+@app.command()
+def cameras() -> None:
+    """List the cameras that are known."""
+    from uavkit import workflow
+
+    for profile in workflow.cameras():
+        size = f"{profile.interior.width_px} x {profile.interior.height_px} px"
+        typer.echo(
+            f"{profile.name:24} {profile.maker} {', '.join(profile.models)}; {size}, {profile.focal_length_mm:g} mm"
+        )
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Argument(help="New folder for the demonstration.", show_default=False)],
+    workers: Workers = CORES,
+) -> None:
+    """Simulate a small survey with video and take it through the whole chain to the report."""
+    from uavkit import workflow
+
+    with progress_shown() as progress:
+        project, done = workflow.demo(out, workers, progress)
+    _finish(project, done)
+
+
+def _say(lines: list[str]) -> None:
+    for line in lines:
+        typer.echo(line)
+
+
+def block_summary(block: "Block") -> list[str]:
+    """Return what a surveyor wants to know of a block, in lines."""
+    gnss = len(block.gnss) if block.gnss is not None else 0
+    lines = [
+        f"{len(block.stills)} stills of {block.camera.name}, {gnss} positions, "
+        f"{len(block.control_points)} control points, {len(block.check_points)} check points"
+    ]
+    if block.video is not None:
+        lines.append(f"video: {len(block.video.places)} of {len(block.stills)} stills found in it")
+    return lines + [f"note: {note}" for note in block.notes]
+
+
+def oriented_summary(result: "OrientedBlock") -> list[str]:
+    """Return what a surveyor wants to know of an adjusted block, in lines."""
+    from uavkit.report.measures import accuracy, length_unit
+
+    adjustment, unit = result.adjustment, length_unit(result)
+    total = len(result.images) + len(result.unoriented)
+    lines = [
+        f"{len(result.images)} of {total} stills oriented, {len(adjustment.points_m)} points, "
+        f"datum: {adjustment.datum.value}, sigma0 {adjustment.sigma0:.2f}"
+    ]
+    for name, points in (("control", result.control), ("check", result.check)):
+        found = accuracy(points)
+        if found.points:
+            lines.append(
+                f"{found.points} {name} points: RMSE {1e3 * found.rmse_xy_m:.1f} {unit.thousandth} in position, "
+                f"{1e3 * found.rmse_z_m:.1f} {unit.thousandth} in height"
+            )
+    lines += [f"not oriented: {name}: {reason}" for name, reason in result.unoriented.items()]
+    return lines + [f"note: {note}" for note in (*result.block.notes, *result.notes)]
+
+
+@contextmanager
+def progress_shown() -> Iterator["Progress"]:
+    """Give a callable that shows progress on stderr: bars on a terminal, plain lines elsewhere."""
+    if not sys.stderr.isatty():
+        yield PlainProgress()
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bars
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Bars(*columns, console=Console(stderr=True)) as bars:
+        tasks: dict[str, Any] = {}
+
+        def show(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total)
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield show
+
+
+class PlainProgress:
+    """Progress as lines of text."""
+
+    def __init__(self) -> None:
+        """Begin with no stage."""
+        self._stage = ""
+        self._began_s = self._told_s = 0.0
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Tell of a stage's begin and end, and now and then of its progress, with the time left."""
+        now_s = time.monotonic()
+        if stage != self._stage:
+            self._stage, self._began_s, self._told_s = stage, now_s, float("-inf")
+        if done < total and now_s - self._told_s < LINES_EVERY_S:
+            return
+        self._told_s = now_s
+        left_s = (now_s - self._began_s) / done * (total - done) if done else 0.0
+        left = f", about {_duration(left_s)} left" if 0 < done < total else ""
+        typer.echo(f"{stage}: {done} of {total}{left}", err=True)
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
+def main() -> None:
+    """Run the command line."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,217 @@
+"""The chain, on one screen: load, call, save. The only module that knows all stages."""
+
+import json
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from uavkit.core.block import Block
+from uavkit.core.camera import CameraProfile
+from uavkit.core.errors import InputError
+from uavkit.core.progress import Progress, silent
+from uavkit.core.result import OrientedBlock
+from uavkit.formats.adjustment_file import read_oriented_block, write_adjustment, write_oriented_block
+from uavkit.formats.atomic import write_text
+from uavkit.formats.block_file import read_block, write_block
+from uavkit.formats.camera_profiles import camera_folder, read_camera
+from uavkit.formats.image_files import FileStillSource
+from uavkit.formats.video import FileVideoSource
+from uavkit.project import IngestOptions, Manifest, Original, Project, Stage, Standing
+
+SIMULATION_LABEL = "simulation.json"
+"""Beside simulated stills: which flight they repeat. It holds no truth."""
+DEMO: Mapping[str, Any] = {
+    "scale": 0.25,
+    "strips": 2,
+    "stations_per_strip": 6,
+    "frames_between_stills": 45.0,
+    "gnss_outliers": 1,
+    "check_points": 8,
+}
+
+
+def simulate(out: Path, values: Mapping[str, Any], progress: Progress = silent) -> str:
+    """Simulate a flight with options by name, and return the command that ingests it."""
+    from uavkit.simulate.survey import simulate_survey
+
+    made = simulate_survey(out, _simulation_options(values), progress)
+    label = {name: values.get(name) for name in ("flight", "scale", "strips", "stations_per_strip")}
+    write_text(made.stills / SIMULATION_LABEL, json.dumps(label) + "\n")
+    video = f" --video {made.video}" if made.video else ""
+    return (
+        f"uavkit ingest SURVEY --images {made.stills}{video} --positions {made.positions} "
+        f"--control-points {made.control_points} --check-points {made.check_points} --camera ricoh_gx200"
+    )
+
+
+def begin_survey(project: Project, originals: Mapping[str, Path], options: IngestOptions) -> None:
+    """Write the manifest of a survey, new or again; settings of process that it has are kept."""
+    found: dict[Any, Original] = {role: project.original(path) for role, path in originals.items()}
+    known = project.manifest.process if (project.folder / "manifest.json").is_file() else ()
+    simulated = _simulated_flight(originals["images"])
+    project.save_manifest(Manifest(originals=found, ingest=options, process=known, simulated=simulated))
+
+
+def choose_settings(project: Project, settings: Sequence[str]) -> None:
+    """Note the settings ``section.option=value`` of process; raises InputError for one that does not exist."""
+    from uavkit.process.options import ProcessOptions, with_settings
+
+    with_settings(ProcessOptions(), list(settings))
+    project.save_manifest(project.manifest.model_copy(update={"process": tuple(settings)}))
+
+
+def ingest(project: Project, progress: Progress = silent) -> Block:
+    """Make the block of a survey and keep it."""
+    with project.running(Stage.INGEST):
+        from uavkit.ingest.build_block import build_block  # type: ignore[import-not-found]
+
+        block: Block = build_block(project, progress)
+        write_block(project.block_file, block)
+    return block
+
+
+def process(project: Project, workers: int = 1, progress: Progress = silent) -> OrientedBlock:
+    """Orient the block of a survey and keep the result; finished steps of a killed run are found again."""
+    from uavkit.process.options import ProcessOptions, with_settings
+    from uavkit.process.orient import orient_block
+
+    _require(project, Stage.INGEST)
+    options = with_settings(ProcessOptions(), list(project.manifest.process))
+    stills, video, cache = _stills(project), _video(project), project.cache(Stage.PROCESS)
+    with project.running(Stage.PROCESS):
+        block = read_block(project.block_file)
+        result = orient_block(block, stills, video, options, cache=cache, workers=workers, progress=progress)
+        _write_result(project, result)
+        cache.forget_unused()
+    return result
+
+
+def _write_result(project: Project, result: OrientedBlock) -> None:
+    from uavkit.formats.orientation_files import write_exterior_orientations, write_interior_orientation
+    from uavkit.formats.point_files import write_las
+
+    folder = project.stage_folder(Stage.PROCESS)
+    write_oriented_block(project.result_file, result)
+    write_adjustment(folder / "adjustment.json", result)
+    write_exterior_orientations(folder / "exterior_orientation.csv", result)
+    write_interior_orientation(folder / "interior_orientation.toml", result)
+    write_las(folder / "points.laz", result)
+
+
+def report(project: Project, progress: Progress = silent) -> Path:
+    """Write the report of a survey and return its page."""
+    from uavkit.report.page import write_report
+    from uavkit.report.tables import PaperComparison
+
+    _require(project, Stage.PROCESS)
+    flight = project.manifest.simulated
+    comparison = PaperComparison(flight=flight) if flight else None
+    with project.running(Stage.REPORT):
+        result, folder = oriented_block(project), project.stage_folder(Stage.REPORT)
+        return write_report(result, folder, survey=project.folder.name, comparison=comparison, progress=progress)
+
+
+def run(project: Project, workers: int = 1, progress: Progress = silent) -> list[str]:
+    """Do every stage that is out of date, in order, and return their names."""
+    done = []
+    for stage in Stage:
+        if next(entry for entry in project.status() if entry.stage is stage).standing is Standing.DONE:
+            continue
+        if stage is Stage.INGEST:
+            ingest(project, progress)
+        elif stage is Stage.PROCESS:
+            process(project, workers, progress)
+        else:
+            report(project, progress)
+        done.append(stage.value)
+    return done
+
+
+def demo(out: Path, workers: int = 1, progress: Progress = silent) -> tuple[Project, list[str]]:
+    """Simulate a small survey and take it through the whole chain; what is already there and complete is kept."""
+    flight, project = out / "flight", Project(out / "survey")
+    if not (flight / "stills" / SIMULATION_LABEL).is_file():
+        simulate(flight, {**DEMO, "workers": workers}, progress)
+    originals = {
+        "images": flight / "stills",
+        "video": flight / "video.avi",
+        "positions": flight / "positions.kml",
+        "control_points": flight / "control_points.csv",
+        "check_points": flight / "check_points.csv",
+    }
+    with project.locked():
+        begin_survey(project, originals, IngestOptions(camera="ricoh_gx200"))
+        return project, run(project, workers, progress)
+
+
+def export(project: Project, target: str, folder: Path) -> list[Path]:
+    """Write the result of a survey for other programs into a folder, and return the files."""
+    from uavkit.formats.colmap_files import write_colmap_model
+    from uavkit.formats.point_files import write_las, write_ply
+
+    _require(project, Stage.PROCESS)
+    if target == "colmap":
+        write_colmap_model(folder / "colmap", oriented_block(project))
+        return sorted((folder / "colmap").glob("*.txt"))
+    write, path = (write_ply if target == "ply" else write_las), folder / f"points.{target}"
+    write(path, oriented_block(project))
+    return [path]
+
+
+def oriented_block(project: Project) -> OrientedBlock:
+    """Return the result of process."""
+    return read_oriented_block(project.result_file)
+
+
+def report_page(project: Project) -> Path:
+    """Return where the page of the report lies."""
+    return project.stage_folder(Stage.REPORT) / "report.html"
+
+
+def cameras() -> list[CameraProfile]:
+    """Return the cameras that are known, in the order of their names."""
+    return [read_camera(path) for path in sorted(camera_folder().glob("*.toml"))]
+
+
+def _require(project: Project, stage: Stage) -> None:
+    """Raise InputError where a stage that others build on is not up to date."""
+    entry = next(entry for entry in project.status() if entry.stage is stage)
+    if entry.standing is not Standing.DONE:
+        why = f" ({entry.why})" if entry.why else ""
+        raise InputError(
+            f"{project.folder}: {stage.value} is {entry.standing.value}{why}: run 'uavkit {stage.value}' first, or "
+            f"'uavkit run' for all"
+        )
+
+
+def _stills(project: Project) -> FileStillSource:
+    folder = project.original_path("images")
+    if folder is None:
+        raise InputError(f"{project.folder}: the manifest names no images: run 'uavkit ingest' again")
+    return FileStillSource(folder)
+
+
+def _video(project: Project) -> FileVideoSource | None:
+    path = project.original_path("video")
+    return FileVideoSource(path) if path else None
+
+
+def _simulation_options(values: Mapping[str, Any]) -> Any:
+    """Return SimulationOptions of plain values; enums are given by their value."""
+    from uavkit.simulate.options import SimulationOptions
+
+    defaults = SimulationOptions()
+    kinds = {name: type(getattr(defaults, name)) for name in values}
+    typed = {name: kinds[name](value) if issubclass(kinds[name], Enum) else value for name, value in values.items()}
+    return SimulationOptions(**typed)
+
+
+def _simulated_flight(images: Path) -> Any:
+    """Return the flight of the paper that simulated stills repeat in full, "" for all others."""
+    try:
+        label = json.loads((images / SIMULATION_LABEL).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return ""
+    whole = {"scale": 1.0, "strips": 3, "stations_per_strip": 11}
+    return label["flight"] if isinstance(label, dict) and whole.items() <= label.items() else ""
