@@ -98,8 +98,9 @@ def _with_up(model: Array, target: Array, sigma_m: Array, up_in_model: Array) ->
     length_model = float(np.sqrt(np.sum((model - model.mean(axis=0)) ** 2)))
     if length_model <= 0.0 or length < 3.0 * float(sigma_m.max()) / np.sqrt(len(model)):
         return None
-    width = float(np.linalg.svd(target - target.mean(axis=0), compute_uv=False)[1])
-    if width > 3.0 * float(sigma_m.max()):
+    # The model tells the width: that of the positions themselves grows with their noise and their number.
+    width = length / length_model * float(np.linalg.svd(model - model.mean(axis=0), compute_uv=False)[1])
+    if width > 5.0 * float(sigma_m.max()):  # the rotation about the strip is then good to 1 / 5 rad
         return fit_similarity(model, target)
     # Two more points above the middle: their weight is that of the direction up, good to some degrees.
     ratio = length / length_model
