@@ -235,7 +235,7 @@ def test_free_network_without_anything(result: OrientedBlock, tmp_path: Path) ->
         "Local coordinates; the place on earth is not known.",
     ):
         assert said in page.text
-    assert " mm" not in page.text.replace("0 mm at", "").replace("Principal distance 5.1134 mm", "")
+    assert " mm" not in page.text.replace("Principal distance 5.1134 mm", "")
     assert "model units" in page.text
 
 
@@ -324,3 +324,13 @@ def test_five_hundred_stills(make_result: Callable[..., OrientedBlock], tmp_path
     assert "Exterior orientation of each still (500 rows)" in page.titles
     assert len(page.table("Still", "Strip")) == 500
     assert (tmp_path / "report.html").stat().st_size < 8_000_000
+
+
+def test_a_facade_has_no_map_of_overlap(result: OrientedBlock, tmp_path: Path) -> None:
+    level = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # looks north
+    facade = replace(
+        bare(result), adjustment=replace(bare(result).adjustment, R_object_from_image=np.tile(level, (8, 1, 1)))
+    )
+    page = read(write_report(facade, tmp_path))
+    assert "too much sideways for a map of overlap" in page.text
+    assert "outlines of the stills" not in page.text

@@ -25,7 +25,7 @@ from uavkit.report.drawing import (
     plain_axes,
     shortened,
 )
-from uavkit.report.measures import determined_points, length_unit, rays_of_points
+from uavkit.report.measures import determined_points, length_unit, rays_of_points, view_tilts_deg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,6 +34,8 @@ MOST_FOOTPRINTS = 60
 """Above this, outlines of footprints would hide the ground."""
 MOST_NAMES = 30
 MOST_BARS = 40
+STEEPEST_MEDIAN_TILT_DEG = 60.0
+"""Against the vertical; beyond this (facades) footprints on the ground tell nothing."""
 MOST_OVERLAP_WORK = 4_000_000
 """Projections (cells times stills) that the overlap map may cost."""
 
@@ -83,7 +85,8 @@ def plan_view(result: OrientedBlock, ground: Ground) -> Drawing:
     axes.set_ylim(south, north)
     plain_axes(axes, f"East [{unit}]", f"North [{unit}]")
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, borderaxespad=0.2, handletextpad=0.3)
-    outlines = ", outlines of the stills on the ground" if len(result.images) <= MOST_FOOTPRINTS else ""
+    drawn = len(result.images) <= MOST_FOOTPRINTS and not _looks_sideways(result)
+    outlines = ", outlines of the stills on the ground" if drawn else ""
     strips = ", strips (lines)" if np.any(result.strips >= 0) else ""
     caption = f"Stations (squares){strips}{outlines}, and object points coloured by height."
     return Drawing(name="plan", title="Stations and points from above", caption=caption, figure=figure)
@@ -111,7 +114,7 @@ def _strip_lines(result: OrientedBlock) -> Iterator[Array]:
 
 
 def _footprints(axes: "Axes", result: OrientedBlock, ground: Ground) -> None:
-    if len(result.images) > MOST_FOOTPRINTS:
+    if len(result.images) > MOST_FOOTPRINTS or _looks_sideways(result):
         return
     for exterior in exteriors(result):
         try:
@@ -163,7 +166,8 @@ def oblique_view(result: OrientedBlock, ground: Ground) -> Drawing:
     top = float(stations[:, 2].max()) if len(stations) else high
     bottom = min(low, top)
     axes.set(xlim=(west, east), ylim=(south, north), zlim=(bottom, max(top, high)))
-    axes.set_box_aspect((east - west, north - south, max(top, high) - bottom), zoom=1.22)
+    sides = (east - west, north - south, max(top, high) - bottom)
+    axes.set_box_aspect(sides, zoom=1.22 if sides[2] < 0.35 * max(sides) else 1.0)
     axes.view_init(elev=28.0, azim=-62.0)
     axes.locator_params(axis="z", nbins=4)
     axes.locator_params(axis="y", nbins=5)
@@ -174,6 +178,10 @@ def oblique_view(result: OrientedBlock, ground: Ground) -> Drawing:
 
 def overlap_map(result: OrientedBlock, ground: Ground) -> Drawing:
     """Draw how many stills see each place of the ground."""
+    name, title = "overlap", "Overlap"
+    if _looks_sideways(result):
+        absent = "The stills look too much sideways for a map of overlap from above."
+        return Drawing(name=name, title=title, caption="", absent=absent)
     unit = length_unit(result).whole
     cells = ground.height_m.size
     most = MOST_OVERLAP_WORK / max(len(result.images), 1)
@@ -202,7 +210,11 @@ def overlap_map(result: OrientedBlock, ground: Ground) -> Drawing:
         f"Stills that see each place of the ground (hidden places are not looked for). {share:.0f} % of the ground "
         f"seen at all is seen by three stills or more. Beyond the points their nearest heights are taken."
     )
-    return Drawing(name="overlap", title="Overlap", caption=caption, figure=figure)
+    return Drawing(name=name, title=title, caption=caption, figure=figure)
+
+
+def _looks_sideways(result: OrientedBlock) -> bool:
+    return float(np.median(view_tilts_deg(result))) > STEEPEST_MEDIAN_TILT_DEG
 
 
 def _overlap_bounds(counts: Indices) -> list[int]:

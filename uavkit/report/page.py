@@ -63,7 +63,8 @@ tbody th { font-weight: 400; }
 details { margin: 1rem 0; } summary { cursor: pointer; font-weight: 600; padding: .2rem 0; }
 @page { margin: 16mm 14mm; }
 @media print { body { padding: 0; font-size: 10pt; max-width: none; } h2, h3 { break-after: avoid; }
-  tr, .verdict, .key, .short { break-inside: avoid; } .scroll { overflow: visible; } thead { display: table-header-group; }
+  tr, .verdict, .key, .short { break-inside: avoid; }
+  .scroll { overflow: visible; } thead { display: table-header-group; }
   details::details-content { content-visibility: visible; block-size: auto; } .wide table { font-size: 6.4pt; }
   .weight, .key, h2, .verdict { print-color-adjust: exact; -webkit-print-color-adjust: exact; } }
 """
@@ -81,8 +82,11 @@ def write_report(
     """Write ``report.html`` and ``figures/*.png`` into a folder and return the path of the page.
 
     ``survey`` is the name in the headline and ``date`` is printed below it as it stands; without them the page depends
-    on the result alone, byte for byte. Raises InputError where the folder cannot be written.
+    on the result alone, byte for byte. Raises InputError where the folder cannot be written, AdjustmentError where no
+    still is oriented.
     """
+    if not result.images:
+        raise AdjustmentError("no still of the block is oriented: there is nothing to report")
     pictures = _figures(result, folder, progress)
     title = survey or "Photogrammetric survey"
     body = [
