@@ -122,6 +122,18 @@ def test_the_same_oriented_block_gives_the_same_file(tmp_path: Path) -> None:
     assert (tmp_path / "one.npz").read_bytes() == (tmp_path / "two.npz").read_bytes()
 
 
+def test_a_spoilt_byte_of_an_oriented_block_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "oriented.npz"
+    write_oriented_block(path, oriented_block())
+    good = path.read_bytes()
+    for place in range(100, len(good) // 2, len(good) // 40):
+        spoilt = bytearray(good)
+        spoilt[place : place + 20] = b"\xff" * 20
+        path.write_bytes(spoilt)
+        with pytest.raises(InputError, match=r"oriented\.npz"):
+            read_oriented_block(path)
+
+
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
 def test_a_damaged_oriented_block_says_so(tmp_path: Path, share: float) -> None:
     path = tmp_path / "oriented.npz"

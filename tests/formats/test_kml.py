@@ -112,9 +112,20 @@ def test_damaged_kmz_and_missing_file(tmp_path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[60:90] = bytes(30)
     path.write_bytes(content)
-    for bad in (path, tmp_path / "absent.kml"):
+    packed = tmp_path / "packed.kmz"
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("doc.kml", kml(point("A", "139,35,77")) * 20)
+    content = bytearray(packed.read_bytes())
+    content[60:90] = b"\xff" * 30
+    packed.write_bytes(content)
+    for bad in (path, packed, tmp_path / "absent.kml"):
         with pytest.raises(InputError, match=bad.name):
             read_positions(bad)
+
+
+def test_an_unknown_encoding_is_an_input_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"way\.kml: no valid KML"):
+        read_positions(write(tmp_path, kml(point("A", "139,35")).replace("UTF-8", "UTF-1")))
 
 
 @settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, derandomize=True)

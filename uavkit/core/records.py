@@ -16,6 +16,7 @@ class GnssFix:
     latitude_deg: float
     longitude_deg: float
     height_m: float
+    """NaN where the source gives a position without any height."""
     height_datum: HeightDatum
     sigma_horizontal_m: float | None = None
     """For each axis; None where the source does not say."""

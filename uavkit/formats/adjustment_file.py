@@ -7,6 +7,7 @@ and never NaN. Coordinates and differences are in the local frame: east, north, 
 import json
 import math
 import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -102,7 +103,7 @@ def read_oriented_block(path: Path) -> OrientedBlock:
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, KeyError, NotImplementedError, zlib.error, zipfile.BadZipFile) as error:
         why = error.strerror if isinstance(error, OSError) and error.strerror else "damaged or of another format"
         raise InputError(f"{path}: cannot be read ({why}): run process again") from error
     record = arrays.pop("record", np.zeros(0, dtype=np.uint8))

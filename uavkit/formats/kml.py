@@ -6,6 +6,7 @@ position without altitude. A document type declaration is refused, so that no en
 
 import re
 import zipfile
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -90,7 +91,7 @@ def _kml_bytes(path: Path) -> bytes:
             if main.file_size > _LARGEST_KML_BYTES:
                 raise InputError(f"{path}: {main.filename} would unpack to {main.file_size} bytes: that is no flight")
             return archive.read(main)
-    except zipfile.BadZipFile as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise InputError(f"{path}: the KMZ is damaged ({error}): export it again") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
@@ -107,7 +108,7 @@ def _parse(path: Path, content: bytes) -> ElementTree.Element:
     try:
         guard.Parse(content, True)
         return ElementTree.fromstring(content)
-    except (expat.ExpatError, ElementTree.ParseError) as error:
+    except (expat.ExpatError, ElementTree.ParseError, LookupError, ValueError) as error:  # encodings too
         raise InputError(f"{path}: no valid KML ({error}): export it again") from error
 
 
