@@ -18,10 +18,12 @@ from uavkit.process.bundle_robust import (
     RETURNING_ROUNDS,
     CutRule,
     cut_weights,
+    revived,
     robust_start,
     same,
     tukey_solution,
     used_rays,
+    without_unchecked,
 )
 from uavkit.process.bundle_system import (
     BundleSystem,
@@ -61,7 +63,8 @@ def adjust_block(
     if options.robust:
         state, weights = robust_start(system, state)
         state, weights = tukey_solution(system, state, weights, options, progress)
-        rule = CutRule(reject_above=options.reject_above, may_return=True)
+        rule = CutRule(reject_above=options.reject_above, may_return=True, gross_above=options.tukey_c)
+        weights = revived(system, weights)
         weights = cut_weights(system, state, weights, precision_at(system, state, weights), rule)
     while True:
         state, iterations, converged = solve(system, state, weights, options)
@@ -72,7 +75,10 @@ def adjust_block(
         rule = CutRule(reject_above=options.reject_above, may_return=rounds < RETURNING_ROUNDS)
         next_weights = cut_weights(system, state, weights, precision, rule)
         if same(next_weights, weights):
-            break
+            next_weights = without_unchecked(system, weights)
+            if same(next_weights, weights):
+                break
+            rounds = max(rounds, RETURNING_ROUNDS)
         weights = next_weights
         progress("bundle block adjustment: rejection", rounds, REJECTION_ROUNDS)
     return _result(system, state, weights, precision, _Run(options, iterations, converged, joint_points))

@@ -112,7 +112,11 @@ def _weighted(
     parts = [
         np.nan_to_num(function(values / scale), nan=0.0) * part / np.asarray(scale) ** 2
         for function, values, scale, part in zip(
-            (functions[0], functions[1], functions[1]), largest, scales, (full.rays, full.gnss, full.control), strict=True
+            (functions[0], functions[1], functions[1]),
+            largest,
+            scales,
+            (full.rays, full.gnss, full.control),
+            strict=True,
         )
     ]
     return Weights(rays=parts[0], gnss=parts[1], control=parts[2], scales=scales)
@@ -139,16 +143,28 @@ def reintersected(system: BundleSystem, state: State, scale: Array | float) -> S
     return replace(state, points=points)
 
 
+def revived(system: BundleSystem, weights: Weights) -> Weights:
+    """Return weights in which points of less than one and a half rays' weight count with all their rays.
+
+    Otherwise a point once lost would have no residuals that could bring it back.
+    """
+    full = np.broadcast_to(np.asarray(weights.scales[0]) ** -2.0, weights.rays.shape)
+    share = np.bincount(system.point_of_ray, weights.rays / full, minlength=len(system.rays.start) - 1)
+    lost = (share < 1.5)[system.point_of_ray]
+    return replace(weights, rays=np.where(lost, full, weights.rays))
+
+
 def robust_start(system: BundleSystem, state: State) -> tuple[State, Weights]:
     """Return a first solution from approximate values that may be bad, amid gross errors that may be many.
 
-    The approximate orientations count as observations; the scale, of each image its own, starts at the size of the first
-    misclosures and sinks step by step; points are intersected anew in each step. Redundancy numbers take orientations as
-    fixed here: what counts is that a ray of a point of few rays has a small residual whatever its error.
+    The approximate orientations count as observations; the scale, of each image its own, starts at the size of the
+    first misclosures and sinks step by step; points are intersected anew in each step. Redundancy numbers take the
+    orientations as fixed here: what counts is that a ray of a point of few rays has a small residual whatever its error.
     """
     weights, damping = system.full_weights(), 1e-4
     anchored, scales = system, np.zeros(0)
     for number in range(START_STEPS):
+        weights = revived(system, weights)
         leverages = local_leverage(system, state, weights)
         found = normalised(system, state, weights, leverages)
         scales = image_scales(system, found, scales)
@@ -210,10 +226,11 @@ def tukey_solution(
     function = partial(tukey_weight, c=options.tukey_c)
     for number in range(TUKEY_ROUNDS):
         progress("bundle block adjustment: robust weights", number, TUKEY_ROUNDS)
+        last, weights = weights, revived(system, weights)
         leverages = _leverages(precision_at(system, state, weights))
         state = reintersected(system, state, normalised(system, state, weights, leverages).scale(0))
         found = normalised(system, state, weights, leverages)
-        last, weights = weights, _weighted(system, found, found.scales, (function, function))
+        weights = _weighted(system, found, found.scales, (function, function))
         for _ in range(4):
             step = gauss_newton_step(system, state, weights, damping)
             state, damping = step.state, step.damping
@@ -224,9 +241,7 @@ def tukey_solution(
     return state, weights
 
 
-def cut_weights(
-    system: BundleSystem, state: State, weights: Weights, precision: Precision, rule: "CutRule"
-) -> Weights:
+def cut_weights(system: BundleSystem, state: State, weights: Weights, precision: Precision, rule: "CutRule") -> Weights:
     """Return weights of 1 within and 0 beyond the cut; of a point's used rays only the worst goes at once."""
     found = normalised(system, state, weights, _leverages(precision))
     rays, gnss, control = (values / scale for values, scale in zip(found.largest, found.scales, strict=True))
@@ -235,7 +250,8 @@ def cut_weights(
     worst = np.zeros(len(system.rays.start) - 1)
     magnitude = np.where(used, np.nan_to_num(rays, nan=np.inf), 0.0)
     np.maximum.at(worst, system.point_of_ray, magnitude)
-    keep = used & (inside | (magnitude < worst[system.point_of_ray]))
+    spared = used & (magnitude < worst[system.point_of_ray]) & (magnitude < rule.gross_above)
+    keep = used & (inside | spared)
     if rule.may_return:
         keep |= inside
     return Weights(
@@ -251,6 +267,22 @@ class CutRule:
 
     reject_above: float
     may_return: bool
+    gross_above: float = np.inf
+    """Beyond this an observation goes at once, even if another of its point is worse."""
+
+
+def without_unchecked(system: BundleSystem, weights: Weights) -> Weights:
+    """Return weights without those points that lost rays and have two left, unless they are control points.
+
+    Of three rays any two may agree, and if two of them are wrong in the same way it is the good one that is rejected;
+    with two left nothing shows it.
+    """
+    points = len(system.rays.start) - 1
+    left = np.bincount(system.point_of_ray, weights.rays > 0.0, minlength=points)
+    unchecked = (left < 3) & (left < np.diff(system.rays.start))
+    if system.given.control is not None and system.uses_control:
+        unchecked[system.given.control.point_index[weights.control > 0.0]] = False
+    return replace(weights, rays=weights.rays * ~unchecked[system.point_of_ray])
 
 
 def same(a: Weights, b: Weights) -> bool:

@@ -493,7 +493,16 @@ def local_leverage(system: BundleSystem, state: State, weights: Weights) -> tupl
 
     def work(first: int, last: int) -> None:
         point_precision(
-            system.rays, state.unknowns, weights.rays, system.free, coordinates, first, last, none, covariances, leverage
+            system.rays,
+            state.unknowns,
+            weights.rays,
+            system.free,
+            coordinates,
+            first,
+            last,
+            none,
+            covariances,
+            leverage,
         )
 
     list(in_chunks(system, work))

@@ -153,3 +153,55 @@ def intersect_robustly(
                 best = pair_best
         if np.isfinite(best):
             points[p] = best_point
+
+
+@kernel
+def adjust_points(
+    rays: RayTable, unknowns: Unknowns, used: Flags, first: int, last: int, points: Array, covariances: Array,
+    leverage: Array,
+) -> None:  # fmt: skip
+    """Adjust points first to last by Gauss-Newton from their used rays; write covariances and leverages of all rays.
+
+    All NaN where fewer than two used rays, or nearly parallel ones, do not determine a point or its iteration fails.
+    """
+    computed, bp, br, bi = np.empty(2), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 10))
+    normal, inverse, right, step = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    for p in range(first, last):
+        converged = False
+        for _ in range(20):
+            normal[:], right[:] = 0.0, 0.0
+            for ray in range(rays.start[p], rays.start[p + 1]):
+                i = rays.image[ray]
+                if not used[ray] or not differentiate(
+                    unknowns.interior, unknowns.centres[i], unknowns.rotations[i], points[p], computed, bp, br, bi
+                ):
+                    continue
+                for axis in range(2):
+                    factor = 1.0 / rays.sigma_px[ray, axis] ** 2
+                    misclosure = rays.xy_px[ray, axis] - computed[axis]
+                    for k in range(3):
+                        right[k] += factor * bp[axis, k] * misclosure
+                        for m in range(3):
+                            normal[k, m] += factor * bp[axis, k] * bp[axis, m]
+            if not invert_point(normal, inverse):
+                break
+            step[:] = inverse @ right
+            points[p] += step
+            if np.dot(step, normal @ step) < 1e-8:
+                converged = True
+                break
+        if not converged:
+            points[p] = np.nan
+            covariances[p] = np.nan
+            for ray in range(rays.start[p], rays.start[p + 1]):
+                leverage[ray] = np.nan
+            continue
+        covariances[p] = inverse
+        for ray in range(rays.start[p], rays.start[p + 1]):
+            i = rays.image[ray]
+            leverage[ray] = np.nan
+            if differentiate(
+                unknowns.interior, unknowns.centres[i], unknowns.rotations[i], points[p], computed, bp, br, bi
+            ):
+                for axis in range(2):
+                    leverage[ray, axis] = np.dot(bp[axis], inverse @ bp[axis]) / rays.sigma_px[ray, axis] ** 2
