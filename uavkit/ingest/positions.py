@@ -1,0 +1,337 @@
+"""Join positions that carry no still's name or time with the stills: by order, checked by geometry, never shifted.
+
+Waypoint lists give one position for each exposure, in order; lists with a point too few or too many are the trade's
+classic source of positions that all belong to the neighbouring still. What can settle it: the placemarks' names, their
+times, the stills' own EXIF positions, and the distances between positions against the times between stills. What none
+of them settles is left out and named.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from uavkit.core.arrays import Array
+from uavkit.core.frames import LocalFrame
+from uavkit.core.records import GnssFix, StillInfo
+from uavkit.ingest.sequence_alignment import (
+    AlignmentOptions,
+    SequenceAlignment,
+    align_by_order,
+    align_sequences,
+    decide,
+    no_clock,
+)
+
+LOG_LEFT_OUT = -3.0
+"""Logarithm of the weight of a still without position, or a position without still, where the counts differ."""
+LOG_LEFT_OUT_EQUAL = -9.0
+"""The same where the counts are equal: then order is right but for strong contradictions."""
+LONGEST_SKIP = 4
+"""Stills or positions that may be missing one after another."""
+STRAY_SHARE = 0.12
+"""Steps that tell nothing: an outlier at one end, a turn, a wait."""
+FAR_M = 20_000.0
+"""Positions this far from the median of all are none of this flight."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PositionOptions:
+    """What counts where the source of positions does not say it."""
+
+    sigma_horizontal_m: float = 1.0
+    """Of a listed position, for each axis: single frequency with SBAS."""
+    sigma_vertical_m: float = 2.0
+    exif_sigma_horizontal_m: float = 1.5
+    exif_sigma_vertical_m: float = 3.0
+    wanted_probability: float = 0.99
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JoinedPositions:
+    """The position of each still, as far as it can be told."""
+
+    fixes: tuple[GnssFix | None, ...]
+    """One for each still, in their order."""
+    probability: Array
+    """(n,) that the position belongs to the still; 0 where there is none."""
+    from_exif: bool
+    discarded: tuple[str, ...]
+    """Positions that belong to no still, with the reason."""
+    notes: tuple[str, ...]
+
+    @property
+    def count(self) -> int:
+        """Number of stills with a position."""
+        return sum(fix is not None for fix in self.fixes)
+
+
+def join_positions(
+    infos: Sequence[StillInfo],
+    fixes: Sequence[GnssFix],
+    absent: Sequence[str] = (),
+    options: PositionOptions = PositionOptions(),
+) -> JoinedPositions:
+    """Return the position of each still among listed ones.
+
+    ``absent`` names stills that were taken but cannot be read: they keep their place in the order.
+    """
+    near, discarded = _without_far(fixes)
+    slots = _slots(infos, absent)
+    by_name = _by_name(slots, near)
+    if by_name is not None:
+        return _result(infos, slots, by_name, near, discarded, ["positions joined with stills by their names"])
+    if len(near) >= 3 * len(slots) and len(near) > 20:
+        note = (
+            f"{len(near)} positions for {len(slots)} stills: that is a track, not a list of exposures, and is not "
+            "used; give the positions of the exposures"
+        )
+        return _result(infos, slots, {}, near, discarded, [note])
+    alignment, how = _align(slots, near, options)
+    pairs = {int(i): (int(j), float(p)) for (i, j), p in zip(alignment.pairs, alignment.probability, strict=True)}
+    discarded = [*discarded, *(f"{_called(near, j)}: belongs to no still" for j in alignment.second_unpaired)]
+    notes = [*_count_notes(slots, near, pairs, how), *_open_notes(slots, alignment)]
+    return _result(infos, slots, pairs, near, discarded, notes)
+
+
+def exif_positions(infos: Sequence[StillInfo]) -> JoinedPositions:
+    """Return the positions that the stills themselves carry."""
+    fixes = [info.position for info in infos]
+    without = [info.name for info in infos if info.position is None]
+    notes = []
+    if len(without) < len(infos):
+        notes.append(f"positions from the EXIF of {len(infos) - len(without)} stills")
+        if without:
+            notes.append(f"{len(without)} stills without EXIF position: {', '.join(without)}")
+    probability = np.array([0.0 if fix is None else 1.0 for fix in fixes])
+    return JoinedPositions(
+        fixes=tuple(fixes), probability=probability, from_exif=True, discarded=(), notes=tuple(notes)
+    )
+
+
+def fix_sigmas(fix: GnssFix, from_exif: bool, options: PositionOptions) -> tuple[float, float, float]:
+    """Return the sigmas of east, north, up in metres: the fix's own where it states them."""
+    horizontal = options.exif_sigma_horizontal_m if from_exif else options.sigma_horizontal_m
+    vertical = options.exif_sigma_vertical_m if from_exif else options.sigma_vertical_m
+    h = fix.sigma_horizontal_m or horizontal
+    return h, h, fix.sigma_vertical_m or vertical
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Slot:
+    """A still that was taken, whether it can be read or not."""
+
+    name: str
+    info: StillInfo | None
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in re.split(r"([0-9]+)", name.casefold())]
+
+
+def _slots(infos: Sequence[StillInfo], absent: Sequence[str]) -> list[_Slot]:
+    """Put unreadable stills where their names say, if the readable ones are in the order of their names."""
+    slots = [_Slot(name=info.name, info=info) for info in infos]
+    keys = [_natural(slot.name) for slot in slots]
+    if any(a > b for a, b in pairwise(keys)):
+        return slots
+    slots += [_Slot(name=name, info=None) for name in absent]
+    return sorted(slots, key=lambda slot: _natural(slot.name))
+
+
+def _without_far(fixes: Sequence[GnssFix]) -> tuple[list[GnssFix], list[str]]:
+    """Take out positions at 0, 0 and such that lie unreasonably far from all others."""
+    if not fixes:
+        return [], []
+    place = _east_north(fixes)
+    middle = np.median(place, axis=0)
+    far = np.linalg.norm(place - middle, axis=1) > FAR_M
+    reasons = [
+        f"{_called(fixes, n)}: {np.linalg.norm(place[n] - middle) / 1000:.0f} km from the others"
+        for n in map(int, np.flatnonzero(far))
+    ]
+    return [fix for fix, bad in zip(fixes, far, strict=True) if not bad], reasons
+
+
+def _east_north(fixes: Sequence[GnssFix]) -> Array:
+    """Return metres (n, 2) in a plane through the median position; good to some tenths of a per cent near it."""
+    latitude, longitude = np.array([[fix.latitude_deg, fix.longitude_deg] for fix in fixes]).T
+    frame = LocalFrame.at(float(np.median(latitude)), float(np.median(longitude)), 0.0)
+    return frame.enu_from_geographic(latitude, longitude, np.zeros(len(fixes)))[:, :2]
+
+
+def _called(fixes: Sequence[GnssFix], index: int) -> str:
+    name = fixes[index].name
+    return f"position {index + 1} ({name})" if name else f"position {index + 1}"
+
+
+def _by_name(slots: Sequence[_Slot], fixes: Sequence[GnssFix]) -> dict[int, tuple[int, float]] | None:
+    """Return pairs where at least half of the positions bear a still's name (with or without its ending)."""
+    known: dict[str, int] = {}
+    for index, slot in enumerate(slots):
+        known[slot.name.casefold()] = index
+        known.setdefault(slot.name.rsplit(".", 1)[0].casefold(), index)
+    rows = [known.get(fix.name.strip().casefold()) for fix in fixes]
+    hits = [row for row in rows if row is not None]
+    if 2 * len(hits) < len(fixes) or not hits or len(set(hits)) != len(hits):
+        return None
+    return {row: (j, 1.0) for j, row in enumerate(rows) if row is not None}
+
+
+def _align(slots: Sequence[_Slot], fixes: Sequence[GnssFix], options: PositionOptions) -> tuple[SequenceAlignment, str]:
+    """Align by the best knowledge there is: times, EXIF positions, or distances against intervals."""
+    settings = AlignmentOptions(wanted_probability=options.wanted_probability, jitter_s=0.1, first_resolution_s=1.0)
+    stills_s = _still_times(slots)
+    fixes_ns = [fix.gps_time_ns for fix in fixes if fix.gps_time_ns is not None]
+    if stills_s is not None and len(fixes_ns) == len(fixes) and all(a < b for a, b in pairwise(fixes_ns)):
+        fixes_s = np.array([time - fixes_ns[0] for time in fixes_ns]) * 1e-9
+        return align_sequences(stills_s, fixes_s, settings), "times"
+    own = [slot.info.position if slot.info is not None else None for slot in slots]
+    if sum(fix is not None for fix in own) >= 2:
+        return align_by_order(_nearness(own, fixes), settings), "EXIF positions"
+    matrix = _step_probabilities(stills_s, _east_north(fixes) if fixes else np.zeros((0, 2)), len(slots))
+    return _decided(matrix, options), "order and distances" if stills_s is not None else "order"
+
+
+def _decided(matrix: Array, options: PositionOptions) -> SequenceAlignment:
+    """Cut a matrix of probabilities into pairs and what is left open."""
+    return decide(matrix, no_clock(), AlignmentOptions(wanted_probability=options.wanted_probability))
+
+
+def _still_times(slots: Sequence[_Slot]) -> Array | None:
+    times = [slot.info.camera_time_ns if slot.info is not None else None for slot in slots]
+    known = [time for time in times if time is not None]
+    if len(known) < len(times) or len(known) < 2 or any(a > b for a, b in pairwise(known)):
+        return None
+    return np.array([time - known[0] for time in known]) * 1e-9
+
+
+def _nearness(own: Sequence[GnssFix | None], fixes: Sequence[GnssFix]) -> Array:
+    """Return evidence (n, m): EXIF and listed positions of one exposure agree within some metres."""
+    given = [fix for fix in own if fix is not None]
+    place = _east_north([*given, *fixes])
+    rows = iter(place[: len(given)])
+    evidence = np.zeros((len(own), len(fixes)))
+    for i, fix in enumerate(own):
+        if fix is not None:
+            distance = np.linalg.norm(place[len(given) :] - next(rows), axis=1)
+            evidence[i] = np.maximum(6.0 - 0.5 * (distance / 3.0) ** 2, -8.0)
+    return evidence
+
+
+def _step_probabilities(stills_s: Array | None, place_m: Array, stills: int) -> Array:
+    """Return the probability (n, m) of each pair from the order and from distances against intervals.
+
+    All chains of pairs are weighed (forward and backward): each step from one pair to the next by how well the distance
+    fits the interval, each still or position that is left out by a fixed weight.
+    """
+    n, m = stills, len(place_m)
+    if min(n, m) == 0:
+        return np.zeros((n, m))
+    left_out = LOG_LEFT_OUT_EQUAL if n == m else LOG_LEFT_OUT
+    step = _log_steps(stills_s, place_m, n)
+    ends = np.asarray(left_out * (np.arange(n)[:, None] + np.arange(m)[None, :]), dtype=np.float64)
+    forward = _chain(step, ends, left_out)
+    turned = _chain(_reversed_steps(step, n, m), ends, left_out)[::-1, ::-1]
+    total = forward + ends[::-1, ::-1]
+    peak = float(total.max())
+    log_sum = peak + np.log(np.exp(total - peak).sum())
+    return np.asarray(np.exp(np.minimum(forward + turned - log_sum, 0.0)))
+
+
+_Steps = dict[tuple[int, int], Array]
+"""For (stills, positions) gone forward: (n, m) log weight of the step that begins at each pair."""
+
+
+def _reversed_steps(step: _Steps, n: int, m: int) -> _Steps:
+    """The same steps for both sequences turned round."""
+    result = {}
+    for (di, dj), weight in step.items():
+        turned = np.full((n, m), -np.inf)
+        turned[: n - di, : m - dj] = weight[: n - di, : m - dj][::-1, ::-1]
+        result[di, dj] = turned
+    return result
+
+
+def _chain(step: _Steps, ends: Array, left_out: float) -> Array:
+    """Return (n, m) the log sum over all chains that lead to each pair, that pair included."""
+    n, m = ends.shape
+    sums = ends.copy()
+    for i in range(1, n):
+        for j in range(1, m):
+            terms = [sums[i, j]]
+            for (di, dj), weight in step.items():
+                if di <= i and dj <= j:
+                    terms.append(sums[i - di, j - dj] + weight[i - di, j - dj] + left_out * (di + dj - 2))
+            values = np.array(terms)
+            peak = values.max()
+            sums[i, j] = peak + np.log(np.exp(values - peak).sum())
+    return sums
+
+
+def _log_steps(stills_s: Array | None, place_m: Array, n: int) -> _Steps:
+    """Return how well each step fits: distance against interval times the usual speed, heavy tails for outliers.
+
+    The weight of a step that fits is about 0; the worst is log of ``STRAY_SHARE``.
+    """
+    m = len(place_m)
+    usual_m = float(np.median(np.linalg.norm(np.diff(place_m, axis=0), axis=1))) if m > 1 else 0.0
+    steps = {}
+    for di in range(1, min(LONGEST_SKIP, n - 1) + 1):
+        for dj in range(1, min(LONGEST_SKIP, m - 1) + 1):
+            weight = np.full((n, m), -np.inf)
+            if stills_s is None or usual_m <= 0.0:
+                weight[: n - di, : m - dj] = 0.0
+            else:
+                usual_s = float(np.median(np.diff(stills_s)))
+                expected = (stills_s[di:] - stills_s[:-di]) / max(usual_s, 1e-9) * usual_m
+                distance = np.linalg.norm(place_m[dj:] - place_m[:-dj], axis=1)
+                spread = 0.25 * usual_m + 1.5
+                fit = np.exp(-0.5 * ((distance[None, :] - expected[:, None]) / spread) ** 2)
+                weight[: n - di, : m - dj] = np.log((1.0 - STRAY_SHARE) * fit + STRAY_SHARE)
+            steps[di, dj] = weight
+    return steps
+
+
+def _count_notes(
+    slots: Sequence[_Slot], fixes: Sequence[GnssFix], pairs: dict[int, tuple[int, float]], how: str
+) -> list[str]:
+    if len(slots) == len(fixes):
+        return [f"{len(pairs)} positions joined with stills by {how}, the counts are equal"]
+    word = "fewer" if len(fixes) < len(slots) else "more"
+    text = f"{len(fixes)} positions are {word} than {len(slots)} stills: {len(pairs)} joined by {how}"
+    if len(pairs) < min(len(slots), len(fixes)):
+        text += "; nothing settles to which still the others belong, so they are left out"
+    return [text]
+
+
+def _open_notes(slots: Sequence[_Slot], alignment: SequenceAlignment) -> list[str]:
+    notes = []
+    if alignment.first_ambiguous:
+        names = ", ".join(slots[i].name for i in alignment.first_ambiguous)
+        notes.append(f"{len(alignment.first_ambiguous)} stills whose position is ambiguous and left out: {names}")
+    if alignment.first_unpaired:
+        names = ", ".join(slots[i].name for i in alignment.first_unpaired)
+        notes.append(f"{len(alignment.first_unpaired)} stills without position: {names}")
+    return notes
+
+
+def _result(
+    infos: Sequence[StillInfo],
+    slots: Sequence[_Slot],
+    pairs: dict[int, tuple[int, float]],
+    fixes: Sequence[GnssFix],
+    discarded: Sequence[str],
+    notes: Sequence[str],
+) -> JoinedPositions:
+    by_name = {slots[i].name: (fixes[j], probability) for i, (j, probability) in pairs.items()}
+    found = [by_name.get(info.name) for info in infos]
+    return JoinedPositions(
+        fixes=tuple(None if entry is None else entry[0] for entry in found),
+        probability=np.array([0.0 if entry is None else entry[1] for entry in found]),
+        from_exif=False,
+        discarded=tuple(discarded),
+        notes=tuple(notes),
+    )
