@@ -170,7 +170,7 @@ def test_an_interrupted_stage_says_that_its_steps_are_kept(project: Project) -> 
 
     with pytest.raises(KeyboardInterrupt):
         interrupted()
-    assert why(project, Stage.PROCESS) == "interrupted; finished steps are kept"
+    assert why(project, Stage.PROCESS) == "not finished; the steps that were are kept"
 
 
 @pytest.mark.parametrize(

@@ -138,15 +138,16 @@ def ingest(
     survey: Survey,
     images: Annotated[Path, typer.Option(help="Folder of the stills.", show_default=False)],
     camera: Annotated[
-        str, typer.Option(help="A name that 'uavkit cameras' lists, or a camera file.", show_default=False)
-    ],
+        str, typer.Option(help="As 'uavkit cameras' lists it, or a camera file; else as EXIF says.")
+    ] = "",
     video: Annotated[Path | None, typer.Option(help="Video of the finder.")] = None,
     positions: Annotated[Path | None, typer.Option(help="KML or KMZ with the exposure positions.")] = None,
     control_points: Annotated[Path | None, typer.Option(help="Ground control points with their marks.")] = None,
     check_points: Annotated[Path | None, typer.Option(help="Check points with their marks, held back.")] = None,
     height_datum: Annotated[
-        Literal["ellipsoid", "geoid", "unknown"], typer.Option(help="What the heights of the positions count from.")
-    ] = "unknown",
+        Literal["ellipsoid", "geoid", "unknown"] | None,
+        typer.Option(help="What the heights of the positions count from; else as their file says."),
+    ] = None,
     crs: Annotated[str, typer.Option(help="EPSG code of the results; else that of the control file, else UTM.")] = "",
     pixel_origin: Annotated[
         Literal["centre", "corner"] | None,
@@ -163,8 +164,14 @@ def ingest(
         "positions": positions,
         "control_points": control_points,
         "check_points": check_points,
+        "camera": Path(camera) if camera.lower().endswith(".toml") else None,
     }
-    options = IngestOptions(camera=camera, height_datum=height_datum, crs=crs, pixel_origin=pixel_origin or "")
+    options = IngestOptions(
+        camera="" if originals["camera"] else camera,
+        height_datum=height_datum or "",
+        crs=crs,
+        pixel_origin=pixel_origin or "",
+    )
     project = Project(survey)
     with project.locked(), progress_shown() as progress:
         workflow.begin_survey(project, {role: path for role, path in originals.items() if path is not None}, options)

@@ -57,9 +57,10 @@ class Original(_Strict):
 class IngestOptions(_Strict):
     """What the user says of the originals."""
 
-    camera: str
-    height_datum: Literal["ellipsoid", "geoid", "unknown"] = "unknown"
-    """Of the heights in the positions file and in EXIF."""
+    camera: str = ""
+    """Name of a profile; empty: what EXIF tells. A file of one's own is an original."""
+    height_datum: Literal["", "ellipsoid", "geoid", "unknown"] = ""
+    """Of the heights in the positions file and in EXIF; empty: what these say themselves."""
     crs: str = ""
     """Horizontal system of the control file and of the results; empty: that of the control file, else UTM."""
     pixel_origin: Literal["", "centre", "corner"] = ""
@@ -71,7 +72,7 @@ class Manifest(_Strict):
 
     uavkit_survey: Literal[1] = 1
     """Version of this file's format."""
-    originals: dict[Literal["images", "video", "positions", "control_points", "check_points"], Original]
+    originals: dict[Literal["images", "video", "positions", "control_points", "check_points", "camera"], Original]
     ingest: IngestOptions
     process: tuple[str, ...] = ()
     """Settings ``section.option=value`` that differ from the defaults."""
@@ -245,7 +246,7 @@ class Project:
         path = self.stage_folder(stage) / STATE
         if not path.is_file():
             begun = (self.stage_folder(stage) / CACHE).is_dir()
-            why = "interrupted; finished steps are kept" if begun else "not run yet"
+            why = "not finished; the steps that were are kept" if begun else "not run yet"
             return StageStatus(stage=stage, standing=Standing.MISSING, why=why)
         if stale is not None:
             why = f"{stale.stage.value} is {stale.standing.value}"

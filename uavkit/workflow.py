@@ -9,13 +9,16 @@ from typing import Any
 from uavkit.core.block import Block
 from uavkit.core.camera import CameraProfile
 from uavkit.core.errors import InputError
+from uavkit.core.heights import HeightDatum
 from uavkit.core.progress import Progress, silent
 from uavkit.core.result import OrientedBlock
 from uavkit.formats.adjustment_file import read_oriented_block, write_adjustment, write_oriented_block
 from uavkit.formats.atomic import write_text
 from uavkit.formats.block_file import read_block, write_block
-from uavkit.formats.camera_profiles import camera_folder, read_camera
+from uavkit.formats.camera_profiles import camera_folder, load_camera, read_camera
+from uavkit.formats.control_file import ControlFileOptions, PixelOrigin, SurveyedPoints, read_surveyed_points
 from uavkit.formats.image_files import FileStillSource
+from uavkit.formats.kml import KmlPositions
 from uavkit.formats.video import FileVideoSource
 from uavkit.project import IngestOptions, Manifest, Original, Project, Stage, Standing
 
@@ -41,7 +44,7 @@ def simulate(out: Path, values: Mapping[str, Any], progress: Progress = silent) 
     video = f" --video {made.video}" if made.video else ""
     return (
         f"uavkit ingest SURVEY --images {made.stills}{video} --positions {made.positions} "
-        f"--control-points {made.control_points} --check-points {made.check_points} --camera ricoh_gx200"
+        f"--control-points {made.control_points} --check-points {made.check_points}"
     )
 
 
@@ -64,11 +67,36 @@ def choose_settings(project: Project, settings: Sequence[str]) -> None:
 def ingest(project: Project, progress: Progress = silent) -> Block:
     """Make the block of a survey and keep it."""
     with project.running(Stage.INGEST):
-        from uavkit.ingest.build_block import build_block  # type: ignore[import-not-found]
-
-        block: Block = build_block(project, progress)
+        block = _built_block(project, progress)
         write_block(project.block_file, block)
     return block
+
+
+def _built_block(project: Project, progress: Progress) -> Block:
+    from uavkit.ingest.build_block import IngestOptions, Sources, build_block
+
+    told, positions, camera = (
+        project.manifest.ingest,
+        project.original_path("positions"),
+        project.original_path("camera"),
+    )
+    sources = Sources(
+        stills=_stills(project),
+        video=_video(project),
+        positions=KmlPositions(positions) if positions else None,
+        control=_surveyed(project, "control_points"),
+        check=_surveyed(project, "check_points"),
+    )
+    profile = read_camera(camera) if camera else load_camera(told.camera) if told.camera else None
+    datum = HeightDatum(told.height_datum) if told.height_datum else None
+    return build_block(sources, profile, IngestOptions(crs=told.crs, height_datum=datum), progress)
+
+
+def _surveyed(project: Project, role: str) -> SurveyedPoints | None:
+    path, origin = project.original_path(role), project.manifest.ingest.pixel_origin
+    if path is None:
+        return None
+    return read_surveyed_points(path, ControlFileOptions(pixel_origin=PixelOrigin(origin)) if origin else None)
 
 
 def process(project: Project, workers: int = 1, progress: Progress = silent) -> OrientedBlock:
@@ -141,7 +169,7 @@ def demo(out: Path, workers: int = 1, progress: Progress = silent) -> tuple[Proj
         "check_points": flight / "check_points.csv",
     }
     with project.locked():
-        begin_survey(project, originals, IngestOptions(camera="ricoh_gx200"))
+        begin_survey(project, originals, IngestOptions())
         return project, run(project, workers, progress)
 
 
