@@ -22,6 +22,9 @@ from uavkit.process.bundle import adjust_block
 RESECTION_TOLERANCE_PX = 10.0
 """A point agrees with a resection within this: lens distortion is not yet known."""
 LEAST_RESECTION_POINTS = 12
+LEAST_PAIR_POINTS = 25
+LEAST_SCALE_POINTS = 3
+"""A still with too few known points for a resection is attached by relative orientation and a scale."""
 LEAST_ANGLE_RAD = np.radians(2.0)
 """Rays that meet at less do not fix a point's depth."""
 _IMAGE_FROM_VISION = np.diag([1.0, -1.0, -1.0])
@@ -91,14 +94,17 @@ def orient_approximately(
     _start_with_pair(block, rays)
     _intersect(block, rays)
     next_adjustment, failed = 3, dict[int, int]()
-    while (image := _next_still(block, rays, failed)) is not None:
-        if _resect(block, rays, image):
-            _intersect(block, rays)
-            if int(block.oriented.sum()) >= next_adjustment:
-                rays = _adjust(block, rays, sigmas)
-                next_adjustment = int(np.ceil(1.25 * block.oriented.sum()))
-        else:
+    while True:
+        image = _next_still(block, rays, failed)
+        if image is not None and not _resect(block, rays, image):
             failed[image] = _known_points_in(block, rays)[image]
+            continue
+        if image is None and not _attach(block, rays):
+            break
+        _intersect(block, rays)
+        if int(block.oriented.sum()) >= next_adjustment:
+            rays = _adjust(block, rays, sigmas)
+            next_adjustment = int(np.ceil(1.25 * block.oriented.sum()))
         progress("approximate orientation", int(block.oriented.sum()), counts[0])
     rays = _adjust(block, rays, sigmas)
     _explain(block, rays)
@@ -133,9 +139,18 @@ def common_points(rays: RayTable, images: int) -> Array:
     return full
 
 
+def _largest_part(common: Array) -> Array:
+    """Return the counts (n, n) of common points within the largest part of the stills that hang together, else 0."""
+    from scipy.sparse.csgraph import connected_components
+
+    _, label = connected_components(common >= LEAST_RESECTION_POINTS, directed=False)
+    largest = label == np.argmax(np.bincount(label))
+    return np.asarray(np.where(largest[:, None] & largest[None, :], common, 0.0))
+
+
 def _start_with_pair(block: GrowingBlock, rays: RayTable) -> None:
-    """Orient the pair with the most well-intersecting points, out of the twenty richest pairs."""
-    common = np.triu(common_points(rays, len(block.centres)))
+    """Orient the pair with the most well-intersecting points, out of the twenty richest pairs of the largest part."""
+    common = np.triu(_largest_part(common_points(rays, len(block.centres))))
     richest = np.argsort(-common, axis=None, kind="stable")[:20]
     best: tuple[float, int, int, Array, Array] | None = None
     for flat in richest.tolist():
@@ -209,6 +224,47 @@ def _resect(block: GrowingBlock, rays: RayTable, image: int) -> bool:
     block.centres[image] = (-rotation.T @ shift).ravel()
     block.rotations[image] = rotation.T @ _IMAGE_FROM_VISION
     return True
+
+
+def _attach(block: GrowingBlock, rays: RayTable) -> bool:
+    """Orient a still by relative orientation to an oriented one, its base scaled by a few points known already.
+
+    The way of the aeropolygon: where stills overlap little more than half, hardly a point is seen in three, too few
+    for a resection; but a scale needs only some.
+    """
+    common = common_points(rays, len(block.centres))
+    common[~block.oriented] = 0
+    common[:, block.oriented] = 0
+    for flat in np.argsort(-common, axis=None, kind="stable")[:40].tolist():
+        here, image = divmod(flat, len(common))
+        if common[here, image] < LEAST_PAIR_POINTS:
+            return False
+        rotation, base, score = _relative_orientation(rays, here, image, block.interior)
+        scale = _base_scale(block, rays, (here, image), rotation, base) if score > 0 else 0.0
+        if scale > 0:
+            block.rotations[image] = block.rotations[here] @ rotation
+            block.centres[image] = block.centres[here] + scale * block.rotations[here] @ base
+            return True
+    return False
+
+
+def _base_scale(block: GrowingBlock, rays: RayTable, pair: tuple[int, int], rotation: Array, base: Array) -> float:
+    """Return the length of the base between two stills from the distances of known points; 0 where they disagree."""
+    rows_here, rows_there = _pair_rays(rays, *pair)
+    known = block.known[rays.point[rows_here]]
+    rows_here, rows_there = rows_here[known], rows_there[known]
+    if len(rows_here) < LEAST_SCALE_POINTS:
+        return 0.0
+    number = np.tile(np.arange(len(rows_here)), 2)
+    origins = np.vstack([np.zeros((len(rows_here), 3)), np.tile(base, (len(rows_here), 1))])
+    directions = np.vstack([rays.directions[rows_here], rays.directions[rows_there] @ rotation.T])
+    model, angle = intersect_linearly(number, origins, directions, len(rows_here))
+    true = np.linalg.norm(block.points[rays.point[rows_here]] - block.centres[pair[0]], axis=1)
+    ratio = true[angle > LEAST_ANGLE_RAD] / np.linalg.norm(model[angle > LEAST_ANGLE_RAD], axis=1)
+    if len(ratio) < LEAST_SCALE_POINTS:
+        return 0.0
+    middle = float(np.median(ratio))
+    return middle if float(np.median(np.abs(ratio - middle))) < 0.05 * middle else 0.0
 
 
 def intersect_linearly(point: Indices, origins: Array, directions: Array, count: int) -> tuple[Array, Array]:
