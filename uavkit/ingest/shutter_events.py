@@ -22,6 +22,8 @@ SHORTEST_FROZEN_FIELDS = 8
 """A recorder doubles one or two frames now and then: that is no shutter."""
 LONGEST_FROZEN_FIELDS = 160
 LONGEST_FLASH_FIELDS = 6
+ENOUGH_EVENTS = 3
+"""A finder that turns black at the shutter does so each time: then pictures that stand still are those of a hover."""
 VOTE_EVERY = (4, 40)
 """Frames between two measurements of the field order: until there are ``ENOUGH_VOTES``, and afterwards."""
 ENOUGH_VOTES = 12
@@ -175,7 +177,8 @@ def find_shutter_events(scan: VideoScan, order: FieldOrder, frame_interval_ns: i
     taken = np.zeros(len(fields.mean), dtype=np.bool_)
     for a, b, _ in spans:
         taken[max(a - 2, 0) : b + 2] = True
-    spans += [(a, b, "frozen") for a, b in _frozen_runs(fields, taken)]
+    if len(spans) < ENOUGH_EVENTS:
+        spans += [(a, b, "frozen") for a, b in _frozen_runs(fields, taken)]
     events = (_event(fields, span, frame_interval_ns) for span in sorted(spans))
     return tuple(event for event in events if event is not None)
 
@@ -205,26 +208,30 @@ def _difference(fields: _Fields, one: Indices, two: Indices) -> Array:
 def _end_of_frozen(fields: _Fields, begin: int) -> int:
     """Return the first field that no longer shows what the first ones after ``begin`` show.
 
-    A frozen picture differs from its first field by the noise alone; a live one moves further away with each field.
+    A frozen picture ends with a jump, for the camera went on meanwhile; the line's noise creeps into it slowly through
+    the codec. Pictures that move away from the first without a jump were live.
     """
     end = min(begin + LONGEST_FROZEN_FIELDS, len(fields.mean))
-    if end - begin < 6:
+    if end - begin < 8:
         return begin
     places = np.arange(begin + 2, end)
     first = np.where(fields.row[places] == fields.row[begin], begin, begin + 1)
     away = _difference(fields, places, first)
-    limit = 1.5 * float(away[:2].mean()) + 0.35
-    moved = np.flatnonzero(away > limit)
-    if len(moved) == 0 or moved[0] < 4:
-        return begin
-    return int(places[moved[0]])
+    step = _difference(fields, places, places - 2)
+    usual = np.array([np.median(step[: max(k, 2)]) for k in range(len(step))])
+    jumps = np.flatnonzero(step > 3.0 * usual + 0.5)
+    left = np.flatnonzero(away > 1.2 + 2.0 * float(step[:2].mean()))
+    gone = int(left[0]) if len(left) else len(places)
+    if len(jumps) and 4 <= jumps[0] <= gone:
+        return int(places[jumps[0]])
+    return begin if gone < 10 or not len(left) else int(places[gone])
 
 
 def _frozen_runs(fields: _Fields, taken: Flags) -> list[tuple[int, int]]:
     """Return (begin, end) of frozen pictures apart from ``taken``, and moved on afterwards.
 
     Noise of the line makes frozen pictures differ too; what tells them from live ones is that fields far apart differ
-    no more than neighbours.
+    little more than neighbours.
     """
     count = len(fields.mean)
     places = np.arange(count - STILL_FIELDS)
@@ -233,10 +240,10 @@ def _frozen_runs(fields: _Fields, taken: Flags) -> list[tuple[int, int]]:
     far = _difference(fields, places, places + STILL_FIELDS)
     near = _difference(fields, places, places + 2)
     free = ~(taken[places] | taken[places + STILL_FIELDS // 2] | taken[places + STILL_FIELDS])
-    still = free & (far < 1.25 * near + 0.05) & (far < 0.6 * _running(np.where(free, far, far.max()), 40.0))
+    still = free & (far < 2.0 * near + 0.15) & (far < 0.4 * _running(np.where(free, far, far.max()), 40.0))
     found = []
     for a, b in _runs(still, SHORTEST_FROZEN_FIELDS - 6):
-        begin, end = _extent(fields, (a + b + STILL_FIELDS) // 2, float(np.median(near[a:b])))
+        begin, end = _extent(fields, (a + b + STILL_FIELDS) // 2, float(np.median(far[a:b])))
         if end - begin >= SHORTEST_FROZEN_FIELDS and not taken[max(begin, 0) : end].any():
             found.append((begin, end))
     return found
@@ -247,7 +254,7 @@ def _extent(fields: _Fields, middle: int, noise: float) -> tuple[int, int]:
     low, high = max(middle - LONGEST_FROZEN_FIELDS, 0), min(middle + LONGEST_FROZEN_FIELDS, len(fields.mean))
     places = np.arange(low, high)
     reference = np.where(fields.row[places] == fields.row[middle], middle, min(middle + 1, high - 1))
-    moved = _difference(fields, places, reference) > 1.25 * noise + 0.1
+    moved = _difference(fields, places, reference) > 1.3 * noise + 0.15
     before, after = np.flatnonzero(moved[: middle - low]), np.flatnonzero(moved[middle - low :])
     start = low + int(before[-1]) + 1 if len(before) else low
     end = middle + int(after[0]) if len(after) else high
