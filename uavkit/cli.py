@@ -123,6 +123,7 @@ def simulate(
                 "scale": scale,
                 "strips": strips,
                 "stations_per_strip": stations,
+                "gnss_outliers": min(3, strips * stations // 11),
                 "video_standard": video,
                 "seed": seed,
                 "workers": workers,
