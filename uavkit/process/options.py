@@ -27,7 +27,7 @@ class CandidateOptions:
     """How candidate points are found."""
 
     source: CandidateSource = CandidateSource.AUTO
-    cells: int = 18
+    cells: int = 24
     """Cells of the grid along the longer side of a still; the best points of each cell are taken. 4 to 100."""
     per_cell: int = 2
     """Points for each cell, 1 to 20."""

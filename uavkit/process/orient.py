@@ -232,16 +232,19 @@ def _feature_candidates(place: Workplace, pairs: list[tuple[int, int]]) -> Candi
 def _approximately(place: Workplace, candidates: Candidates, *, last: bool) -> GrowingBlock | None:
     """Orient approximately; without success None, or the error where nothing else can be tried."""
     point, image, xy, _ = candidates.all_rays()
-    block = place.block
+    block, marked, m = place.block, marked_points(place.block), len(candidates)
+    point, image = np.concatenate([point, m + marked.point]), np.concatenate([image, marked.image])
     try:
         with place.step("approximate orientation"):
-            return orient_approximately(
-                ray_table(point, image, xy, block.interior),
-                (len(block.stills), len(candidates)),
+            growing = orient_approximately(
+                ray_table(point, image, np.concatenate([xy, marked.xy_px]), block.interior),
+                (len(block.stills), m + len(marked.points)),
                 block.interior,
                 interior_sigmas(block),
                 place.progress,
             )
+        growing.points = growing.points[:m]
+        return growing
     except AdjustmentError:
         if last:
             raise
