@@ -159,7 +159,8 @@ def robust_start(system: BundleSystem, state: State) -> tuple[State, Weights]:
 
     The approximate orientations count as observations; the scale, of each image its own, starts at the size of the
     first misclosures and sinks step by step; points are intersected anew in each step. Redundancy numbers take the
-    orientations as fixed here: what counts is that a ray of a point of few rays has a small residual whatever its error.
+    orientations as fixed here: what counts is that a ray of a point of few rays has a small residual whatever its
+    error.
     """
     weights, damping = system.full_weights(), 1e-4
     anchored, scales = system, np.zeros(0)

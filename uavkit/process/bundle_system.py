@@ -31,6 +31,9 @@ SMALL = 2000
 BEHIND_CAMERA = 1e3
 """Misclosure, in sigma, that the cost counts for a ray whose point is behind its camera."""
 
+SINGULAR_DAMPING = 1e-5
+"""Up to this, damping carries an iteration past a state where the equations are singular; at its end they must not be."""
+
 T = TypeVar("T")
 
 
@@ -356,65 +359,72 @@ class Step:
 
 
 def gauss_newton_step(system: BundleSystem, state: State, weights: Weights, damping: float) -> Step:
-    """Return the state after one step that does not increase the weighted sum of squares (Levenberg 1944).
+    """Return the state after one step that does not increase the weighted sum of squares.
 
+    A step that does is halved (Armijo 1966); where that does not help, damping grows (Levenberg 1944).
     Raises AdjustmentError where the observations do not determine the unknowns.
     """
     datum = inner_datum(system, state)
-    while True:
+    while damping < 1e6:
         reduced, determined = reduced_normals(system, state, weights, damping)
         before = cost(system, state, weights, determined)
-        factor = system.factorise(reduced, damping, datum)
-        candidate, product = _apply(system, state, weights, damping, (reduced, factor))
-        after = cost(system, candidate, weights, determined)
-        if after <= before * (1.0 + 1e-12) + 1e-9:
-            size = float(np.sqrt(max(product, 0.0)))
-            return Step(
-                state=candidate, damping=damping / 10.0 if damping > 1e-9 else 0.0, size=size, determined=determined
-            )
-        damping = max(damping * 10.0, 1e-6)
-        if damping > 1e6:
-            raise AdjustmentError("the adjustment does not converge: no step lessens the sum of squared residuals")
+        try:
+            factor = system.factorise(reduced, damping, datum)
+        except AdjustmentError:
+            if damping > SINGULAR_DAMPING:
+                raise
+            damping = max(damping * 100.0, 1e-8)
+            continue
+        change = _solve(system, state, weights, damping, factor, reduced)
+        for share in (1.0, 0.5, 0.25, 0.125):
+            candidate = moved(system, state, change, share)
+            if cost(system, candidate, weights, determined) <= before * (1.0 + 1e-11) + 1e-9:
+                size = float(np.sqrt(max(change.product, 0.0)))
+                next_damping = damping / 10.0 if damping > 1e-9 else 0.0
+                return Step(state=candidate, damping=next_damping, size=size, determined=determined)
+        damping = max(damping * 10.0, 1e-8)
+    raise AdjustmentError("the adjustment does not converge: no step lessens the sum of squared residuals")
 
 
-def _apply(
-    system: BundleSystem, state: State, weights: Weights, damping: float, equations: tuple[Reduced, ReducedFactor]
-) -> tuple[State, float]:
-    """Return the state moved by the solution, and step . right-hand side."""
-    reduced, factor = equations
-    full_right = np.concatenate([reduced.right_images.ravel(), reduced.right_border])
-    step = factor.solve(full_right)
-    n, q = len(state.centres), len(system.free)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Change:
+    """Changes of the unknowns, and their product with the right-hand side."""
+
+    images: Array
+    border: Array
+    points: Array
+    product: float
+
+
+def _solve(
+    system: BundleSystem, state: State, weights: Weights, damping: float, factor: ReducedFactor, reduced: Reduced
+) -> Change:
+    """Return the solution of the normal equations."""
+    step = factor.solve(np.concatenate([reduced.right_images.ravel(), reduced.right_border]))
+    n = len(state.centres)
     images, border = np.ascontiguousarray(step[: 6 * n].reshape(n, 6)), np.ascontiguousarray(step[6 * n :])
     coordinates, points = control_coordinates(system, state, weights), np.zeros_like(state.points)
 
     def work(first: int, last: int) -> float:
         return kernels.back_substitute(
-            system.rays,
-            state.unknowns,
-            weights.rays,
-            system.free,
-            coordinates,
-            damping,
-            first,
-            last,
-            images,
-            border,
-            points,
+            system.rays, state.unknowns, weights.rays, system.free, coordinates, damping, first, last, images, border, points
         )
 
-    # Eliminated points took gradient' N_pp^-1 gradient with them; it comes back with their own steps.
     product = float(sum(in_chunks(system, work))) + _direct_product(system, state, weights, images, border)
-    interior = state.interior.copy()
-    interior[system.free] += border[:q]
-    moved = State(
+    return Change(images=images, border=border, points=points, product=product)
+
+
+def moved(system: BundleSystem, state: State, change: Change, share: float) -> State:
+    """Return a state moved by a share of a change."""
+    q, interior = len(system.free), state.interior.copy()
+    interior[system.free] += share * change.border[:q]
+    return State(
         interior=interior,
-        centres=state.centres + images[:, :3],
-        rotations=state.rotations @ rotation_from_vector(images[:, 3:]),
-        points=state.points + points,
-        shifts=state.shifts + border[q:].reshape(-1, 3),
+        centres=state.centres + share * change.images[:, :3],
+        rotations=state.rotations @ rotation_from_vector(share * change.images[:, 3:]),
+        points=state.points + share * change.points,
+        shifts=state.shifts + share * change.border[q:].reshape(-1, 3),
     )
-    return moved, product
 
 
 def _direct_product(system: BundleSystem, state: State, weights: Weights, images: Array, border: Array) -> float:
