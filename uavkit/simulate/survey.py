@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from uavkit.core.arrays import Array
+from uavkit.core.errors import InputError
 from uavkit.core.progress import Progress, silent
 from uavkit.formats.atomic import atomic_path, write_text
 from uavkit.formats.control_file import write_gcp_list, write_points_csv
@@ -92,9 +93,8 @@ def make_scene(options: SimulationOptions) -> Scene:
     camera, flight = true_camera(options.seed, options.scale), make_flight(bare, options)
     count = len(flight.exposure_s)
     names = tuple(f"R{10001 + n:07d}.JPG" for n in range(count))
-    points = options.control_points + options.check_points
-    places = choose_points(bare, flight.stations_m, points, options.control_points, options.seed)
     views = {name: flight.view(camera, float(t)) for name, t in zip(names, flight.exposure_s, strict=True)}
+    places = choose_points(bare, flight.stations_m, tuple(views.values()), options)
     labels = [f"G{n + 1}" for n in range(options.control_points)] + [
         f"C{n + 1:02d}" for n in range(options.check_points)
     ]
@@ -114,12 +114,13 @@ def make_scene(options: SimulationOptions) -> Scene:
 
 
 def simulate_survey(out: Path, options: SimulationOptions, progress: Progress = silent) -> SimulatedSurvey:
-    """Render and write a survey into the folder ``out`` (made where absent; files of an older survey are replaced).
+    """Render and write a survey into the folder ``out`` (made where absent; the same survey's files are replaced).
 
-    Raises InputError where the folder cannot be written.
+    Raises InputError where the folder cannot be written or holds another survey.
     """
     scene = make_scene(options)
     paths = _paths(out, options)
+    _refuse_another_survey(paths, scene.names)
     write_positions(paths.positions, "Waypoints", scene.waypoints.fixes())
     control = surveyed(scene.control, options.control_sigma_m, options, 1)
     write_points_csv(paths.control_points, control)
@@ -133,6 +134,15 @@ def simulate_survey(out: Path, options: SimulationOptions, progress: Progress = 
         with atomic_path(paths.video) as temporary:
             write_video(temporary, scene.finder(), progress)
     return paths
+
+
+def _refuse_another_survey(paths: SimulatedSurvey, names: tuple[str, ...]) -> None:
+    """Stills or a video left from another survey would be taken for part of this one."""
+    left = sorted({path.name for path in paths.stills.glob("*.JPG")} - set(names))
+    if paths.video is None and (paths.folder / "video.avi").exists():
+        left.append("video.avi")
+    if left:
+        raise InputError(f"{paths.folder} holds another survey ({left[0]}): name a new folder, or empty this one")
 
 
 def _paths(out: Path, options: SimulationOptions) -> SimulatedSurvey:
@@ -197,12 +207,15 @@ def truth_of(scene: Scene) -> dict[str, Any]:
 def _readme(scene: Scene) -> str:
     """What lies where, and how to process it."""
     sigma_mm = 1000 * scene.options.control_sigma_m
+    order = scene.options.field_order.value
+    video = f"video.avi           the finder's video, interlaced, {order} field first\n"
+    if scene.options.video_standard is VideoStandard.NONE:
+        video = ""
     seed, scale, flight = scene.options.seed, scene.options.scale, scene.options.flight.value
     return f"""A simulated survey (seed {seed}, scale {scale:g}, flight {flight}).
 
 stills/             {len(scene.names)} stills with the EXIF of the camera; its clock is off
-video.avi           the finder's video, interlaced, {scene.options.field_order.value} field first
-positions.kml       positions of the waypoints, one for each still, from the receiver on board (good to metres)
+{video}positions.kml       positions of the waypoints, one for each still, from the receiver on board (good to metres)
 control_points.csv  {len(scene.control)} control points with their marks in the stills, sigma {sigma_mm:g} mm
 check_points.csv    {len(scene.check)} check points: held back, to judge the result
 gcp_list.txt        the control points in OpenDroneMap's form
@@ -210,7 +223,7 @@ truth/              what is true; no stage of the processing reads it
 
 Process it with
 
-    uavkit new SURVEY --stills stills --video video.avi --positions positions.kml \\
-        --control control_points.csv --check check_points.csv
+    uavkit ingest SURVEY --images stills --video video.avi --positions positions.kml \\
+        --control-points control_points.csv --check-points check_points.csv
     uavkit run SURVEY
 """
