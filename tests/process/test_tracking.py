@@ -20,12 +20,14 @@ from uavkit.process.tracking import (
     TimedPicture,
     TrackingOptions,
     TrackingResult,
+    advance,
     coarse_motion,
     frame_from_half,
     half_from_frame,
     predict,
     square_field,
     square_field_half,
+    start,
     track,
 )
 
@@ -272,3 +274,36 @@ def test_coarse_motion_finds_shift_and_turn(plane: Scene) -> None:
     A, _ = pose(last.time_s)
     points = np.array([[200.0, 150.0], [440.0, 150.0], [320.0, 330.0]])
     assert np.abs(apply_affine(found, points) - apply_affine(A, points)).max() < 8  # what the wide search covers
+
+
+def test_a_match_that_locked_elsewhere_is_found_out(plane: Scene) -> None:
+    pose = straight((20, 60), 1.0, sway_px=0.0)
+    pictures = film(plane, pose, count=40)
+    points = select_points(richness(orientation_codes(pictures[0].image), 25, 0.5), 40, 1, 30)
+    rng = np.random.default_rng(0)
+    state = start(pictures[0], points)
+    for picture in pictures[1:6]:
+        state = advance(state, picture, rng)
+    wrong = int(np.argmin(np.hypot(*(state.points_px - [320, 240]).T)))
+    moved = state.points_px.copy()
+    moved[wrong] += [9.0, -6.0]  # as if it had locked on similar ground, with a template from there
+    source_px, warps = state.source_px.copy(), state.source_warps
+    source_px[wrong] += [9.0, -6.0]
+    strayed = replace(state, points_px=moved, source_px=source_px, source_warps=warps)
+    after = advance(strayed, pictures[6], rng)
+    assert after.misses[wrong] > 0
+    truth = positions(plane, points[wrong : wrong + 1], pose(pictures[6].time_s))
+    assert after.points_px[wrong] == pytest.approx(truth[0], abs=1.0)  # it waits where the neighbours imply it
+
+
+def test_decayed_templates_are_renewed_with_their_warp(plane: Scene) -> None:
+    pose = straight((10, 30), 2.0, turn_deg=60)
+    pictures = film(plane, pose, count=120)
+    eager = TrackingOptions(renewal_dissimilarity=0.0)  # every match counts as decayed
+    outcome = follow(plane, pose, pictures, eager)
+    error = outcome.error_px[outcome.alive]
+    assert outcome.alive.mean() > 0.9
+    # renewed every third picture: the error adds up as a random walk, but nothing jumps
+    assert np.quantile(error, 0.95) < 2.0
+    lasting = follow(plane, pose, pictures)
+    assert np.median(lasting.error_px[lasting.alive]) < np.median(error)

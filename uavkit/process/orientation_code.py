@@ -2,8 +2,9 @@
 
 Ullah, Kaneko, Igarashi (2001), restated in Anai et al. (2012): the direction of the grey-value gradient in N sectors.
 The codes do not change with gain and offset of brightness. Gradients are Sobel's: their binomial cross smoothing is
-the cheapest filter that keeps the direction of a noisy gradient (plain central differences of the unsmoothed picture
-give twice the share of changed codes at a noise of three grey values), and they are integers below 1024.
+the cheapest filter that keeps the direction of a noisy gradient, and they are integers below 1024. Measured at a noise
+of 3 grey values (contrast 40): between two pictures 31 % of the codes change, 0.7 % by more than a sector; with plain
+central differences 44 % and 4 %.
 """
 
 from dataclasses import dataclass
@@ -26,7 +27,9 @@ CODE_COUNT = 16
 NOISE_TO_THRESHOLD = 8.0
 """gamma in units of the noise of one pixel: |dIx| + |dIy| of pure noise has mean 5.5 and standard deviation 3."""
 LEAST_THRESHOLD = 12
-"""gamma for a picture without noise: 1.5 grey values a pixel, as Sobel's gradient is 8 times the slope."""
+"""gamma for a picture without noise: 1.5 grey values a pixel, as Sobel's gradient is 8 times the slope.
+
+On simulated video 9 to 12 kept most points; 20 lost a tenth of them, 45 two thirds."""
 _TEMPLATES_AT_ONCE = 64  # what fits into the second level cache
 _LARGEST_FACTOR = 31  # a Sobel gradient (1020) times this stays in 16 bits
 
