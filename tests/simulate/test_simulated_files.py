@@ -188,3 +188,8 @@ def test_pal_has_its_own_times(smallest_scene: Scene) -> None:
     )
     assert pal.flight.field_interval_s == pytest.approx(0.02)
     assert pal.finder().row_of(0) == 0
+
+
+def test_another_survey_in_the_folder_is_refused(smallest_survey: SimulatedSurvey, smallest_scene: Scene) -> None:
+    with pytest.raises(InputError, match=r"R0010002\.JPG|video\.avi"):
+        simulate_survey(smallest_survey.folder, replace(smallest_scene.options, video_standard=VideoStandard.NONE))

@@ -14,7 +14,7 @@ from uavkit.simulate.options import SimulationOptions
 from uavkit.simulate.site import CRS, site_frame
 from uavkit.simulate.world import SHAPE, World, along_across, enu_from_site
 
-TRIANGLE = ((-0.88, -0.80), (0.86, -0.62), (0.06, 0.85))
+TRIANGLE = ((-0.82, -0.70), (0.80, -0.55), (0.05, 0.72))
 """Of the first three control points, in half extents of the flown area."""
 MARGIN_PX = 15.0
 """Distance of a mark from the border of a still of 4000 px."""
@@ -33,36 +33,44 @@ class TruePoint:
     """Its true image points there, shape (n, 2)."""
 
 
-def choose_points(world: World, stations_m: Array, count: int, control: int, seed: int) -> Array:
-    """Places of signals on open, gentle ground, shape (count, 3): a triangle first, then spread evenly.
+def choose_points(world: World, stations_m: Array, views: Sequence[SimulatedView], options: SimulationOptions) -> Array:
+    """Places of the signals, control first, shape (n, 3): a triangle, then spread evenly; on open, gentle ground.
 
-    ``stations_m`` (n, 3) spans the flown area; the first ``control`` places beyond the triangle lie near its rim.
+    ``stations_m`` (n, 3) spans the flown area. Each place is chosen among several so that many views see it; further
+    control points lie near the rim.
     """
-    rng = np.random.default_rng([seed, 7])
+    rng = np.random.default_rng([options.seed, 7])
     along, across = along_across(stations_m[:, 0], stations_m[:, 1])
     half = np.array([np.ptp(along) / 2 + 2.0, np.ptp(across) / 2 + 3.0])
-    places = [_gentle_place(rng, world, half * TRIANGLE[n]) for n in range(3)]
-    while len(places) < count:
+    places: list[Array] = []
+    for n in range(options.control_points + options.check_points):
         tries = rng.uniform(-0.95, 0.95, (40, 2))
-        if len(places) < control:
-            tries /= np.abs(tries).max(axis=1, keepdims=True)
-        gaps = np.linalg.norm((tries * half)[:, None] - np.array(places)[None], axis=2).min(axis=1)
-        places.append(_gentle_place(rng, world, tries[np.argmax(gaps)] * half))
+        if n < 3:
+            wanted = half * TRIANGLE[n]
+        else:
+            if n < options.control_points:
+                tries *= 0.9 / np.abs(tries).max(axis=1, keepdims=True)
+            gaps = np.linalg.norm((tries * half)[:, None] - np.array(places)[None], axis=2).min(axis=1)
+            wanted = tries[np.argmax(gaps)] * half
+        places.append(_best_place(rng, world, views, wanted, half))
     enu = np.column_stack([np.array(places), np.zeros(len(places))]) @ enu_from_site().T
     enu[:, 2] = world.height_m(enu[:, 0], enu[:, 1])
     return enu
 
 
-def _gentle_place(rng: np.random.Generator, world: World, wanted_m: Array) -> Array:
-    """The wanted place (along, across), moved as little as needed away from boulders and boxes."""
-    clearance = world.ground.bounds[:, :, 0]
-    for attempt in range(400):
-        place = wanted_m + rng.normal(0.0, 0.02 * attempt, 2)
-        column, row = (int((place[k] / CELL_M + 0.5 * (SHAPE[1 - k] - 1)) / COARSE) for k in (0, 1))
-        inside = 0 <= row < clearance.shape[0] and 0 <= column < clearance.shape[1]
-        if inside and clearance[row, column] > 0.5:
-            return np.asarray(place)
-    return np.asarray(wanted_m)
+def _best_place(
+    rng: np.random.Generator, world: World, views: Sequence[SimulatedView], wanted_m: Array, half_m: Array
+) -> Array:
+    """A gentle place (along, across) near the wanted one that many views see; a view is worth 1.5 m of distance."""
+    places = np.vstack([wanted_m[None], wanted_m + rng.normal(0.0, 1.0, (60, 2)) * [2.2, 1.8]])
+    places = np.clip(places, -half_m, half_m)
+    columns, rows = (((places[:, k] / CELL_M + 0.5 * (SHAPE[1 - k] - 1)) / COARSE).astype(int) for k in (0, 1))
+    gentle = world.ground.bounds[rows, columns, 0] > 0.5
+    enu = np.column_stack([places, np.zeros(len(places))]) @ enu_from_site().T
+    enu[:, 2] = world.height_m(enu[:, 0], enu[:, 1])
+    seen = sum(view.sees(world, enu, MARGIN_PX * view.camera.width_px / 4000).astype(int) for view in views)
+    score = np.minimum(seen, 8) - np.linalg.norm(places - wanted_m, axis=1) / 1.5 - 100.0 * ~gentle
+    return np.asarray(places[np.argmax(score)])
 
 
 def observe_points(

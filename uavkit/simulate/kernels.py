@@ -193,8 +193,9 @@ def _march(heights_m: Field, centre: Array, ray: tuple[float, float], depth: flo
 def hits(heights_m: Field, bounds: Field, centre: Array, rays: Array) -> Array:
     """Depths of the first hits of rays (n, 2) from one centre."""
     depths = np.empty(rays.shape[0])
+    above = centre[2] - np.float64(bounds[:, :, 1].max())
     for n in range(rays.shape[0]):
-        depths[n] = first_hit(heights_m, bounds, centre, (rays[n, 0], rays[n, 1]), 0.0)[0]
+        depths[n] = _march(heights_m, centre, (rays[n, 0], rays[n, 1]), above, 9.0)
     return depths
 
 

@@ -208,9 +208,9 @@ def _readme(scene: Scene) -> str:
     """What lies where, and how to process it."""
     sigma_mm = 1000 * scene.options.control_sigma_m
     order = scene.options.field_order.value
-    video = f"video.avi           the finder's video, interlaced, {order} field first\n"
+    video, argument = f"video.avi           the finder's video, interlaced, {order} field first\n", " --video video.avi"
     if scene.options.video_standard is VideoStandard.NONE:
-        video = ""
+        video, argument = "", ""
     seed, scale, flight = scene.options.seed, scene.options.scale, scene.options.flight.value
     return f"""A simulated survey (seed {seed}, scale {scale:g}, flight {flight}).
 
@@ -223,7 +223,7 @@ truth/              what is true; no stage of the processing reads it
 
 Process it with
 
-    uavkit ingest SURVEY --images stills --video video.avi --positions positions.kml \\
+    uavkit ingest SURVEY --images stills{argument} --positions positions.kml \\
         --control-points control_points.csv --check-points check_points.csv
     uavkit run SURVEY
 """
