@@ -211,6 +211,7 @@ def _has_height(crs: str) -> bool:
     return len(parse_crs(crs).axis_info) >= 3
 
 
+@lru_cache(maxsize=64)
 def _three_dimensional(crs: str) -> str:
     parsed = parse_crs(crs)
     return parsed.to_wkt() if _has_height(crs) else parsed.to_3d().to_wkt()

@@ -3,7 +3,7 @@
 import errno
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from uavkit.core.errors import InputError
@@ -24,7 +24,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise InputError(_cause(path, error)) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # whatever kept the file from being made is already told
+            temporary.unlink(missing_ok=True)
 
 
 def _cause(path: Path, error: OSError) -> str:

@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from uavkit.core.arrays import Array, Flags, Image, Indices, content_hash
 from uavkit.core.block import StillInVideo, VideoSync
@@ -32,6 +33,9 @@ _DETECTION_LEVEL = 2
 """Points are chosen on the still at a quarter of its size: texture that the video can still show."""
 _VIDEO_RADIUS = 2.5
 """How far a tracked position may be off, in video pixels."""
+_EXTENDED_RADIUS = 8.0
+"""The same for points whose motion is their neighbours'."""
+_LEAST_NEIGHBOURS = 12
 _MOST_RAYS_CARRIED = 8
 LEAST_THROUGH_VIDEO = 20
 """Verified points that make a gap between two stills bridged."""
@@ -163,7 +167,7 @@ def _gap_key(
     sync = given.sync
     return content_hash(
         [
-            "video 1",
+            "video 2",
             given.video.fingerprint(),
             given.store.fingerprint(image),
             given.store.fingerprint(target),
@@ -183,22 +187,53 @@ def _follow_gap(
     given: VideoInput, places: tuple[StillInVideo, StillInVideo], target: int, points: _Carried, workers: int
 ) -> Arrays:
     """Track points of one still to the next, descend to its pixels, and measure them against their references."""
-    xy, alive, there_from_here = track_between_stills(given, places, points.here_px)
+    tracked_px, tracked, there_from_here = track_between_stills(given, places, points.here_px)
+    xy, extended, there_from_here = extend_motion(points.here_px, tracked_px, tracked, there_from_here)
     warps = there_from_here @ points.here_from_reference
-    radius = _VIDEO_RADIUS * float(np.sqrt(abs(np.linalg.det(given.sync.still_from_video.matrix))))
     found = np.zeros(len(xy), dtype=bool)
-    for reference in np.unique(points.reference_image[alive]).tolist():
-        rows = np.flatnonzero(alive & (points.reference_image == reference))
-        refined = refine_through_pyramid(
-            given.pyramids.get(reference),
-            given.pyramids.get(target),
-            points.reference_px[rows],
-            xy[rows],
-            warps[rows],
-            PyramidOptions(start_radius_px=radius),
-        )
-        xy[rows[refined.ok]], found[rows] = refined.target_px[refined.ok], refined.ok
+    for group, radius in ((tracked, _VIDEO_RADIUS), (extended, _EXTENDED_RADIUS)):
+        for reference in np.unique(points.reference_image[group]).tolist():
+            rows = np.flatnonzero(group & (points.reference_image == reference))
+            refined = refine_through_pyramid(
+                given.pyramids.get(reference),
+                given.pyramids.get(target),
+                points.reference_px[rows],
+                xy[rows],
+                warps[rows],
+                PyramidOptions(start_radius_px=radius * _still_px_per_video_px(given.sync)),
+            )
+            xy[rows[refined.ok]], found[rows] = refined.target_px[refined.ok], refined.ok
     return _measured(given, target, points, xy, warps, found, workers)
+
+
+def _still_px_per_video_px(sync: VideoSync) -> float:
+    return float(np.sqrt(abs(np.linalg.det(sync.still_from_video.matrix))))
+
+
+def extend_motion(here_px: Array, there_px: Array, tracked: Flags, warps: Array) -> tuple[Array, Flags, Array]:
+    """Predict where points (n, 2) went that the video did not show to the end: the finder crops the still's rim.
+
+    Each takes the affine motion of its nearest tracked neighbours, drawn towards that of all. Returns positions
+    (n, 2), which points were predicted so, and there_from_here (n, 2, 2); tracked points stay as they are.
+    """
+    nothing = np.zeros(len(here_px), dtype=bool)
+    if int(tracked.sum()) < _LEAST_NEIGHBOURS:
+        return there_px, nothing, warps
+    here, there = here_px[tracked], there_px[tracked]
+    whole, *_ = np.linalg.lstsq(np.column_stack([here, np.ones(len(here))]), there, rcond=None)
+    rest = np.flatnonzero(~tracked)
+    _, near = cKDTree(here).query(here_px[rest], k=_LEAST_NEIGHBOURS)
+    middle = here[near].mean(axis=1)
+    offset = here[near] - middle[:, None]
+    residual = there[near] - (here[near] @ whole[:2] + whole[2])
+    normal = np.einsum("nki,nkj->nij", offset, offset)
+    normal += 0.5 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(2)
+    extra = np.linalg.solve(normal, np.einsum("nki,nkj->nij", offset, residual))
+    xy, turned = there_px.copy(), warps.copy()
+    base = here_px[rest] @ whole[:2] + whole[2] + residual.mean(axis=1)
+    xy[rest] = base + np.einsum("ni,nij->nj", here_px[rest] - middle, extra)
+    turned[rest] = (whole[:2] + extra).transpose(0, 2, 1)
+    return xy, np.asarray(~tracked), turned
 
 
 def _measured(
