@@ -75,7 +75,7 @@ def adjust_block(
         rule = CutRule(reject_above=options.reject_above, may_return=rounds < RETURNING_ROUNDS)
         next_weights = cut_weights(system, state, weights, precision, rule)
         if same(next_weights, weights):
-            next_weights = without_unchecked(system, weights)
+            next_weights = without_unchecked(system, state, weights)
             if same(next_weights, weights):
                 break
             rounds = max(rounds, RETURNING_ROUNDS)

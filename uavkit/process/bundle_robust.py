@@ -34,12 +34,16 @@ LEAST_REDUNDANCY = 1e-3
 """Redundancy numbers below this say nothing; such residuals are divided by its root."""
 TELLING_REDUNDANCY = 0.05
 """Residuals of less redundancy do not count in the scale of their group."""
+START_REDUNDANCY = 0.3
+"""The same at the start, where residuals without redundancy are not yet small."""
 START_STEPS = 40
 START_C = 6.0
 SHRINK = 2.0
 """The scale of the start sinks at most by this factor a step, so that no image is locked out on the way."""
 ANCHOR = 0.5
 """Sigma of the approximate orientations at the start, as a share of what the first misclosures amount to."""
+FAR_OFF = 50.0
+"""A ray rejected at more sigmas than this cannot be the good one that two wrong ones outvoted."""
 TUKEY_ROUNDS = 8
 REJECTION_ROUNDS = 14
 RETURNING_ROUNDS = 6
@@ -73,7 +77,11 @@ class Normalised:
 
 
 def normalised(
-    system: BundleSystem, state: State, weights: Weights, leverages: tuple[Array, Array, Array]
+    system: BundleSystem,
+    state: State,
+    weights: Weights,
+    leverages: tuple[Array, Array, Array],
+    least_redundancy: float = LEAST_REDUNDANCY,
 ) -> Normalised:
     """Return normalised residuals; ``leverages`` (variance of adjusted over observed) belong to ``weights``.
 
@@ -92,7 +100,7 @@ def normalised(
     ):
         squared = np.broadcast_to(np.asarray(scale) ** 2, weight.shape)[:, None]
         variance = 1.0 + leverage / squared * (1.0 - 2.0 * squared * weight[:, None])
-        variances.append(np.maximum(variance, LEAST_REDUNDANCY))
+        variances.append(np.maximum(variance, least_redundancy))
         z.append(residual / (sigma * np.sqrt(variances[-1])))
     return Normalised(z=(z[0], z[1], z[2]), variance=(variances[0], variances[1], variances[2]))
 
@@ -123,21 +131,22 @@ def _weighted(
 
 
 def reintersected(system: BundleSystem, state: State, scale: Array | float) -> State:
-    """Return a state in which points with misclosures above 3 scales (in sigma) are intersected anew, robustly.
+    """Return a state in which points with misclosures above 2 scales (in sigma) are intersected anew, robustly.
 
     So neither a gross error nor a bad approximate point locks good rays out. The scale is one, or one for each ray.
     """
     z = np.max(np.abs(misclosures(system, state).rays_px / system.rays.sigma_px), axis=1)
     suspicious = np.zeros(len(state.points), dtype=np.bool_)
-    suspicious[system.point_of_ray[~(z <= 3.0 * np.asarray(scale))]] = True
+    suspicious[system.point_of_ray[~(z <= 2.0 * np.asarray(scale))]] = True
     suspicious |= ~np.isfinite(state.points[:, 0])
     if system.given.control is not None and system.uses_control:
         suspicious[system.given.control.point_index] = False
     points = state.points.copy()
-    typical = float(np.median(scale))
+    of_point = np.ones(len(points))
+    np.maximum.at(of_point, system.point_of_ray, np.broadcast_to(scale, z.shape))
 
     def work(first: int, last: int) -> None:
-        intersect_robustly(system.rays, state.unknowns, suspicious, typical, first, last, points)
+        intersect_robustly(system.rays, state.unknowns, suspicious, of_point, first, last, points)
 
     list(in_chunks(system, work))
     return replace(state, points=points)
@@ -167,13 +176,13 @@ def robust_start(system: BundleSystem, state: State) -> tuple[State, Weights]:
     for number in range(START_STEPS):
         weights = revived(system, weights)
         leverages = local_leverage(system, state, weights)
-        found = normalised(system, state, weights, leverages)
+        found = normalised(system, state, weights, leverages, START_REDUNDANCY)
         scales = image_scales(system, found, scales)
         by_ray = ray_scales(system, scales)
         state = reintersected(system, state, by_ray)
         if number == 0:
             anchored = replace(system, anchor=_anchor(system, state, float(np.median(scales))))
-        found = normalised(system, state, weights, leverages)
+        found = normalised(system, state, weights, leverages, START_REDUNDANCY)
         _, gnss, control = found.scales
         functions = partial(tukey_weight, c=START_C), partial(huber_weight, k=1.345)
         weights = _weighted(system, found, (by_ray, gnss, control), functions)
@@ -272,15 +281,17 @@ class CutRule:
     """Beyond this an observation goes at once, even if another of its point is worse."""
 
 
-def without_unchecked(system: BundleSystem, weights: Weights) -> Weights:
+def without_unchecked(system: BundleSystem, state: State, weights: Weights) -> Weights:
     """Return weights without those points that lost rays and have two left, unless they are control points.
 
     Of three rays any two may agree, and if two of them are wrong in the same way it is the good one that is rejected;
-    with two left nothing shows it.
+    with two left nothing shows it. Rays lost far off do not count: that two of those agree is hardly possible.
     """
     points = len(system.rays.start) - 1
     left = np.bincount(system.point_of_ray, weights.rays > 0.0, minlength=points)
-    unchecked = (left < 3) & (left < np.diff(system.rays.start))
+    z = np.max(np.abs(misclosures(system, state).rays_px / system.rays.sigma_px), axis=1)
+    near = (weights.rays == 0.0) & ~(z > FAR_OFF)
+    unchecked = (left < 3) & (np.bincount(system.point_of_ray, near, minlength=points) > 0)
     if system.given.control is not None and system.uses_control:
         unchecked[system.given.control.point_index[weights.control > 0.0]] = False
     return replace(weights, rays=weights.rays * ~unchecked[system.point_of_ray])

@@ -407,7 +407,17 @@ def _solve(
 
     def work(first: int, last: int) -> float:
         return kernels.back_substitute(
-            system.rays, state.unknowns, weights.rays, system.free, coordinates, damping, first, last, images, border, points
+            system.rays,
+            state.unknowns,
+            weights.rays,
+            system.free,
+            coordinates,
+            damping,
+            first,
+            last,
+            images,
+            border,
+            points,
         )
 
     product = float(sum(in_chunks(system, work))) + _direct_product(system, state, weights, images, border)

@@ -88,7 +88,9 @@ def intersect_points(
         np.ascontiguousarray(orientations.R_object_from_image, dtype=np.float64),
         np.full((points, 3), np.nan),
     )
-    intersect_robustly(table, unknowns, np.ones(points, dtype=np.bool_), scale, 0, points, unknowns.points)
+    intersect_robustly(
+        table, unknowns, np.ones(points, dtype=np.bool_), np.full(points, scale), 0, points, unknowns.points
+    )
     point_of_ray = rays.point_index[order]
     used = _support(table, unknowns, point_of_ray, scale * reject_above)
     covariances, leverage, v = np.empty((points, 3, 3)), np.empty((len(order), 2)), np.empty((len(order), 2))

@@ -99,11 +99,11 @@ def refine(
 
 @kernel
 def intersect_robustly(
-    rays: RayTable, unknowns: Unknowns, chosen: Flags, scale: float, first: int, last: int, points: Array
+    rays: RayTable, unknowns: Unknowns, chosen: Flags, scales: Array, first: int, last: int, points: Array
 ) -> None:
     """Write better positions of the chosen points first to last: the best pair of rays.
 
-    Of all pairs that one is best which most other rays support. The scale is that of the normalised misclosures at the
+    Of all pairs that one is best which most other rays support. The scales, (m,), are those of normalised misclosures at the
     present orientations. A point keeps its position where no pair of rays gives a smaller cost.
     """
     most = 1
@@ -113,7 +113,7 @@ def intersect_robustly(
     trial, best_point = np.empty(3), np.empty(3)
     for p in range(first, last):
         begin, end = rays.start[p], rays.start[p + 1]
-        count = end - begin
+        count, scale = end - begin, scales[p]
         if not chosen[p] or count < 2:
             continue
         for a in range(count):
