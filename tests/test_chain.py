@@ -59,7 +59,7 @@ def survey(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Project:
     running = subprocess.Popen(command, cwd=ROOT, env=environment, stderr=subprocess.DEVNULL)
     cache = project.folder / "process" / "cache"
     deadline_s = time.monotonic() + 300.0
-    while not any(cache.glob("*.npz")) and time.monotonic() < deadline_s:
+    while not any(cache.glob("features*.npz")) and time.monotonic() < deadline_s:
         time.sleep(0.02)
     running.send_signal(signal.SIGKILL)
     running.wait()
