@@ -1,6 +1,7 @@
 """The files of a simulated survey look like a camera's, decode, agree with the truth and depend on the seed alone."""
 
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -11,12 +12,13 @@ from PIL import Image
 from uavkit.core.errors import InputError
 from uavkit.core.records import FieldOrder
 from uavkit.formats.control_file import read_surveyed_points
+from uavkit.formats.video import FileVideoSource
 from uavkit.simulate.control import surveyed
 from uavkit.simulate.flight import FieldState
 from uavkit.simulate.options import SimulationOptions, VideoStandard
 from uavkit.simulate.survey import Scene, SimulatedSurvey, make_scene, simulate_survey
 from uavkit.simulate.truth import read_truth
-from uavkit.simulate.video import HEIGHT_PX
+from uavkit.simulate.video import HEIGHT_PX, write_frames
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +60,17 @@ def test_video_decodes_into_the_stated_frames(smallest_survey: SimulatedSurvey, 
         assert float(stream.average_rate) == pytest.approx(30000 / 1001)
         assert stream.codec_context.name == "mpeg4"
         assert next(container.decode(stream)).interlaced_frame
+
+
+@pytest.mark.parametrize("order", [FieldOrder.TOP_FIRST, FieldOrder.BOTTOM_FIRST])
+def test_the_file_states_its_field_order(order: FieldOrder, tmp_path: Path) -> None:
+    planes = np.full((720, 640), 128, dtype=np.uint8)
+    planes[:480:2] = 60
+    planes[1:480:2] = 180
+    write_frames(tmp_path / "fields.avi", [planes] * 3, Fraction(25, 1), order)
+    info = FileVideoSource(tmp_path / "fields.avi").info()
+    assert info.field_order is order
+    assert info.frame_interval_ns == 40_000_000
 
 
 def test_fields_lie_in_the_stated_order(smallest_scene: Scene, frames: list[np.ndarray]) -> None:

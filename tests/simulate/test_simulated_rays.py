@@ -5,6 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from uavkit.core.camera import InteriorOrientation
+from uavkit.core.collinearity import image_coordinates, object_rays
+from uavkit.core.orientation import ExteriorOrientation
 from uavkit.simulate.camera import LATTICE_PX, SimulatedView, true_camera
 from uavkit.simulate.flight import crest_height_m, make_flight, plan_stations
 from uavkit.simulate.kernels import _site_ray
@@ -105,6 +108,19 @@ def test_pycolmap_reprojects_the_marks(smallest_scene: Scene, tmp_path) -> None:
     ]
     assert len(gaps) >= 8
     assert max(gaps) < 0.01
+
+
+def test_core_projects_as_the_simulator_does(smallest_scene: Scene) -> None:
+    """Two codes of the collinearity equations, written apart, agree."""
+    interior = InteriorOrientation(**smallest_scene.camera.as_dict())
+    for index in range(len(smallest_scene.names)):
+        view = smallest_scene.view(index)
+        exterior = ExteriorOrientation(projection_centre_m=view.centre_m, R_object_from_image=view.R_object_from_image)
+        ground = view.intersect(smallest_scene.world, _pixels(view, 200))
+        assert np.abs(image_coordinates(ground, exterior, interior) - view.project(ground)).max() < 1e-8
+        rays = object_rays(_pixels(view, 200), exterior, interior)
+        own = view.rays(_pixels(view, 200))
+        assert np.abs(rays / rays[:, 2:] - own / own[:, 2:]).max() < 1e-10
 
 
 def test_world_is_the_embankment(world: World) -> None:

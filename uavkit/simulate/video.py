@@ -1,7 +1,7 @@
 """The finder's video: fields at their own times, through an analogue line, recorded as MPEG-4 in AVI."""
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -148,23 +148,34 @@ def make_finder(world: World, camera: SimulatedCamera, flight: Flight, options: 
 
 
 def write_video(path: Path, finder: Finder, progress: Progress) -> None:
-    """Encode all frames, interlaced, with the encoder's own MPEG-4; one thread encodes, ``workers`` render."""
+    """Write a finder's whole video; one thread encodes, ``workers`` render."""
+    write_frames(
+        path, _counted(finder, progress), FRAME_RATE[finder.options.video_standard], finder.options.field_order
+    )
+
+
+def _counted(finder: Finder, progress: Progress) -> Iterator[Image]:
+    for number, planes in enumerate(_frames(finder), start=1):
+        yield planes
+        progress("video", number, finder.frame_count)
+
+
+def write_frames(path: Path, frames: Iterable[Image], rate: Fraction, order: FieldOrder) -> None:
+    """Encode woven frames, planar YUV 4:2:0 (720, 640), as interlaced MPEG-4 in AVI (FFmpeg's own encoder)."""
     import av
 
-    rate = FRAME_RATE[finder.options.video_standard]
     with av.open(str(path), "w", format="avi") as container:
         stream = container.add_stream("mpeg4", rate=rate)
         stream.width, stream.height, stream.pix_fmt = WIDTH_PX, HEIGHT_PX, "yuv420p"
         stream.bit_rate, stream.gop_size = BIT_RATE, 15
         stream.thread_count = 1  # the bytes must not depend on the machine
         stream.codec_context.options = {"flags": "+ildct+ilme"}
-        marked = _field_marker(finder.options.field_order, 1 / rate)
-        for number, planes in enumerate(_frames(finder)):
+        marked = _field_marker(order, 1 / rate)
+        for number, planes in enumerate(frames):
             frame = av.VideoFrame.from_ndarray(planes, "yuv420p")
             frame.pts, frame.time_base = number, 1 / rate
             marked.push(frame)
             container.mux(stream.encode(marked.pull()))
-            progress("video", number + 1, finder.frame_count)
         container.mux(stream.encode(None))
 
 
