@@ -37,7 +37,11 @@ class Ground:
         height = np.zeros(len(rays))
         for _ in range(40):
             points = centre + ((height - centre[2]) / rays[:, 2])[:, None] * rays
-            height = self.height_m(points[:, 0], points[:, 1])
+            if self.relief_m == 0.0:
+                return points
+            before, height = height, self.height_m(points[:, 0], points[:, 1])
+            if np.abs(height - before).max() < 1e-6:
+                break
         return centre + ((height - centre[2]) / rays[:, 2])[:, None] * rays
 
 

@@ -22,7 +22,7 @@ def _rays(rng: np.random.Generator, each: int, factors: np.ndarray) -> tuple[np.
 def test_factors_of_all_classes_are_recovered() -> None:
     rng = np.random.default_rng(4)
     truth = np.array([[1.0, 1.5, 3.0], [0.8, 1.2, 2.0], [0.5, 1.0, 4.0]])
-    residuals, sigma, redundancy, angles, *_ = _rays(rng, 1000, truth)
+    residuals, sigma, redundancy, angles, texture, angle = _rays(rng, 1000, truth)
     found = calibrate_sigmas(residuals, sigma, redundancy, angles, np.ones(len(sigma), dtype=bool))
     relative = found.factor / truth[texture, angle]
     # Redundancy of a class: 2000 x 0.6; relative sigma of a factor 1 / sqrt(2 x 1200) = 0.02. Here 4 of them.
