@@ -56,8 +56,8 @@ class MatchingOptions:
     least_gradient: float = 2.0
     """Least root mean square gradient, grey values a pixel, in the direction of weakest texture."""
     least_correlation: float = 0.7
-    most_affine_change: float = 0.35
-    """Largest change of an element of the warp, in units of its scale."""
+    most_affine_change: float = 0.5
+    """Largest change of an element of the warp, in units of its scale; slopes seen from two stations reach 0.4."""
     most_return_miss_px: float = 0.1
     """Used by match_forward_backward: a point whose return misses its start by more is NOT_RETURNED."""
 

@@ -63,6 +63,20 @@ def least_median_affine(
 
 
 @kernel
+def _median(values: NDArray[np.float64], number: int) -> float:
+    """Median of the first few values, which are put in order on the way."""
+    for i in range(1, number):
+        value = values[i]
+        j = i - 1
+        while j >= 0 and values[j] > value:
+            values[j + 1] = values[j]
+            j -= 1
+        values[j + 1] = value
+    middle = number // 2
+    return float(values[middle]) if number % 2 == 1 else float(0.5 * (values[middle - 1] + values[middle]))
+
+
+@kernel
 def neighbour_votes(
     residuals: NDArray[np.float64],
     counted: NDArray[np.bool_],
@@ -87,10 +101,14 @@ def neighbour_votes(
         medians[row, :] = 0.0
         spread[row] = 0.0
         if number > 0:
-            medians[row, 0], medians[row, 1] = np.median(xs[:number]), np.median(ys[:number])
-            for i in range(number):
-                xs[i] = max(abs(xs[i] - medians[row, 0]), abs(ys[i] - medians[row, 1]))
-            spread[row] = 1.4826 * np.median(xs[:number])
+            mx, my = _median(xs, number), _median(ys, number)
+            medians[row, 0], medians[row, 1] = mx, my
+            number = 0
+            for other in neighbours[row]:
+                if other >= 0 and counted[other]:
+                    xs[number] = max(abs(residuals[other, 0] - mx), abs(residuals[other, 1] - my))
+                    number += 1
+            spread[row] = 1.4826 * _median(xs, number)
 
 
 @kernel
@@ -109,41 +127,42 @@ def local_warps(
     limits = (weight of general as a share of the neighbours' scatter, largest departure from general). expected (n, 2)
     gets the position that the neighbours imply for the point; it is left as it is with fewer than four of them.
     """
-    normal = np.zeros((2, 2))
     mixed = np.zeros((2, 2))
     for row in range(start.shape[0]):
+        warps[row, :, :] = general
         number = 0
-        mean_s, mean_c = np.zeros(2), np.zeros(2)
+        sx = sy = cx = cy = 0.0
         for other in neighbours[row]:
             if other >= 0 and counted[other]:
                 number += 1
-                mean_s += start[other]
-                mean_c += current[other]
-        warps[row] = general
+                sx += start[other, 0]
+                sy += start[other, 1]
+                cx += current[other, 0]
+                cy += current[other, 1]
         if number < 4:
             continue
-        mean_s /= number
-        mean_c /= number
-        normal[:] = 0.0
-        mixed[:] = 0.0
+        sx, sy, cx, cy = sx / number, sy / number, cx / number, cy / number
+        nxx = nxy = nyy = 0.0
+        mixed[:, :] = 0.0
         for other in neighbours[row]:
             if other >= 0 and counted[other]:
-                for i in range(2):
-                    si = start[other, i] - mean_s[i]
-                    for j in range(2):
-                        sj = start[other, j] - mean_s[j]
-                        normal[i, j] += si * sj
-                        rest = current[other, j] - mean_c[j]
-                        for k in range(2):
-                            rest -= general[j, k] * (start[other, k] - mean_s[k])
-                        mixed[j, i] += rest * si
-        prior = limits[0] * (normal[0, 0] + normal[1, 1]) + 1e-9
-        a, b, d = normal[0, 0] + prior, normal[0, 1], normal[1, 1] + prior
+                x, y = start[other, 0] - sx, start[other, 1] - sy
+                u = current[other, 0] - cx - general[0, 0] * x - general[0, 1] * y
+                v = current[other, 1] - cy - general[1, 0] * x - general[1, 1] * y
+                nxx += x * x
+                nxy += x * y
+                nyy += y * y
+                mixed[0, 0] += u * x
+                mixed[0, 1] += u * y
+                mixed[1, 0] += v * x
+                mixed[1, 1] += v * y
+        prior = limits[0] * (nxx + nyy) + 1e-9
+        a, b, d = nxx + prior, nxy, nyy + prior
         determinant = a * d - b * b
+        x, y = start[row, 0] - sx, start[row, 1] - sy
         for j in range(2):
             u = (mixed[j, 0] * d - mixed[j, 1] * b) / determinant
             v = (mixed[j, 1] * a - mixed[j, 0] * b) / determinant
             warps[row, j, 0] += min(max(u, -limits[1]), limits[1])
             warps[row, j, 1] += min(max(v, -limits[1]), limits[1])
-            from_mean = warps[row, j, 0] * (start[row, 0] - mean_s[0]) + warps[row, j, 1] * (start[row, 1] - mean_s[1])
-            expected[row, j] = mean_c[j] + from_mean
+            expected[row, j] = (cx if j == 0 else cy) + warps[row, j, 0] * x + warps[row, j, 1] * y
