@@ -131,10 +131,9 @@ def common_points(rays: RayTable, images: int) -> Array:
     """Return how many points each pair of stills has in common, shape (images, images)."""
     from scipy.sparse import coo_matrix
 
-    seen = coo_matrix((np.ones(len(rays.point), np.float64), (rays.image, rays.point))).tocsr()
-    counts = (seen @ seen.T).toarray()
-    full = np.zeros((images, images))
-    full[: counts.shape[0], : counts.shape[1]] = counts
+    shape = (images, int(rays.point.max(initial=-1)) + 1)
+    seen = coo_matrix((np.ones(len(rays.point), np.float64), (rays.image, rays.point)), shape=shape).tocsr()
+    full = np.asarray((seen @ seen.T).toarray())
     np.fill_diagonal(full, 0.0)
     return full
 
