@@ -162,6 +162,8 @@ def test_common_points_of_pairs() -> None:
     assert counts.shape == (5, 5)
     assert (counts[0, 1], counts[1, 0], counts[0, 3], counts[1, 3], counts[2, 3]) == (2, 2, 1, 1, 0)
     assert np.trace(counts) == 0
+    nothing = ray_table(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), NOMINAL)
+    np.testing.assert_array_equal(common_points(nothing, 3), np.zeros((3, 3)))
 
 
 def test_directions_look_along_minus_z_with_y_up() -> None:
