@@ -18,6 +18,8 @@ from uavkit.process.bundle_robust import (
     RETURNING_ROUNDS,
     CutRule,
     cut_weights,
+    lost_points,
+    reintersected,
     revived,
     robust_start,
     same,
@@ -63,7 +65,10 @@ def adjust_block(
     if options.robust:
         state, weights = robust_start(system, state)
         state, weights = tukey_solution(system, state, weights, options, progress)
-        rule = CutRule(reject_above=options.reject_above, may_return=True, gross_above=options.tukey_c)
+        # Wide at first: what took no part so far is judged by redundancy numbers that are only nearly right.
+        wide = max(options.tukey_c, options.reject_above)
+        rule = CutRule(reject_above=wide, may_return=True, gross_above=wide)
+        state = reintersected(system, state, 1.0, lost_points(system, weights))
         weights = revived(system, weights)
         weights = cut_weights(system, state, weights, precision_at(system, state, weights), rule)
     while True:

@@ -30,13 +30,15 @@ from uavkit.process.robust import huber_weight, shrunk_scale, trimmed_scale, tuk
 
 WeightFunction = Callable[[Array], Array]
 
-LEAST_REDUNDANCY = 1e-3
+LEAST_REDUNDANCY = 0.02
 """Redundancy numbers below this say nothing; such residuals are divided by its root."""
 TELLING_REDUNDANCY = 0.05
 """Residuals of less redundancy do not count in the scale of their group."""
 START_REDUNDANCY = 0.3
 """The same at the start, where residuals without redundancy are not yet small."""
 START_STEPS = 40
+CAUCHY_C = 2.385
+"""Constant of Cauchy's weights in intersections, 95 % efficient (Holland and Welsch 1977)."""
 START_C = 6.0
 SHRINK = 2.0
 """The scale of the start sinks at most by this factor a step, so that no image is locked out on the way."""
@@ -130,20 +132,25 @@ def _weighted(
     return Weights(rays=parts[0], gnss=parts[1], control=parts[2], scales=scales)
 
 
-def reintersected(system: BundleSystem, state: State, scale: Array | float) -> State:
-    """Return a state in which points with misclosures above 2 scales (in sigma) are intersected anew, robustly.
+def lost_points(system: BundleSystem, weights: Weights) -> Flags:
+    """Return which points (m,) have less than one and a half rays' weight left."""
+    full = np.broadcast_to(np.asarray(weights.scales[0]) ** -2.0, weights.rays.shape)
+    share = np.bincount(system.point_of_ray, weights.rays / full, minlength=len(system.rays.start) - 1)
+    return np.asarray(share < 1.5)
+
+
+def reintersected(system: BundleSystem, state: State, scale: Array | float, lost: Flags) -> State:
+    """Return a state in which lost points and those with misclosures above 2 scales are intersected anew, robustly.
 
     So neither a gross error nor a bad approximate point locks good rays out. The scale is one, or one for each ray.
     """
     z = np.max(np.abs(misclosures(system, state).rays_px / system.rays.sigma_px), axis=1)
-    suspicious = np.zeros(len(state.points), dtype=np.bool_)
+    suspicious = lost.copy()
     suspicious[system.point_of_ray[~(z <= 2.0 * np.asarray(scale))]] = True
     suspicious |= ~np.isfinite(state.points[:, 0])
-    if system.given.control is not None and system.uses_control:
-        suspicious[system.given.control.point_index] = False
     points = state.points.copy()
     of_point = np.ones(len(points))
-    np.maximum.at(of_point, system.point_of_ray, np.broadcast_to(scale, z.shape))
+    np.maximum.at(of_point, system.point_of_ray, CAUCHY_C * np.broadcast_to(scale, z.shape))
 
     def work(first: int, last: int) -> None:
         intersect_robustly(system.rays, state.unknowns, suspicious, of_point, first, last, points)
@@ -158,8 +165,7 @@ def revived(system: BundleSystem, weights: Weights) -> Weights:
     Otherwise a point once lost would have no residuals that could bring it back.
     """
     full = np.broadcast_to(np.asarray(weights.scales[0]) ** -2.0, weights.rays.shape)
-    share = np.bincount(system.point_of_ray, weights.rays / full, minlength=len(system.rays.start) - 1)
-    lost = (share < 1.5)[system.point_of_ray]
+    lost = lost_points(system, weights)[system.point_of_ray]
     return replace(weights, rays=np.where(lost, full, weights.rays))
 
 
@@ -174,12 +180,12 @@ def robust_start(system: BundleSystem, state: State) -> tuple[State, Weights]:
     weights, damping = system.full_weights(), 1e-4
     anchored, scales = system, np.zeros(0)
     for number in range(START_STEPS):
-        weights = revived(system, weights)
+        lost, weights = lost_points(system, weights), revived(system, weights)
         leverages = local_leverage(system, state, weights)
         found = normalised(system, state, weights, leverages, START_REDUNDANCY)
         scales = image_scales(system, found, scales)
         by_ray = ray_scales(system, scales)
-        state = reintersected(system, state, by_ray)
+        state = reintersected(system, state, by_ray, lost)
         if number == 0:
             anchored = replace(system, anchor=_anchor(system, state, float(np.median(scales))))
         found = normalised(system, state, weights, leverages, START_REDUNDANCY)
@@ -236,9 +242,9 @@ def tukey_solution(
     function = partial(tukey_weight, c=options.tukey_c)
     for number in range(TUKEY_ROUNDS):
         progress("bundle block adjustment: robust weights", number, TUKEY_ROUNDS)
-        last, weights = weights, revived(system, weights)
+        lost, last, weights = lost_points(system, weights), weights, revived(system, weights)
         leverages = _leverages(precision_at(system, state, weights))
-        state = reintersected(system, state, normalised(system, state, weights, leverages).scale(0))
+        state = reintersected(system, state, normalised(system, state, weights, leverages).scale(0), lost)
         found = normalised(system, state, weights, leverages)
         weights = _weighted(system, found, found.scales, (function, function))
         for _ in range(4):

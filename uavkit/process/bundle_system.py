@@ -32,7 +32,7 @@ BEHIND_CAMERA = 1e3
 """Misclosure, in sigma, that the cost counts for a ray whose point is behind its camera."""
 
 SINGULAR_DAMPING = 1e-5
-"""Up to this, damping carries an iteration past a state where the equations are singular; at its end they must not be."""
+"""Up to this, damping carries an iteration past a state of singular equations; at its end they must not be singular."""
 
 T = TypeVar("T")
 

@@ -16,8 +16,8 @@ from uavkit.core.errors import AdjustmentError
 from uavkit.process.kernels.bundle_normals import Reduced
 from uavkit.process.kernels.bundle_precision import Inverse
 
-LEAST_PIVOT = 1e-13
-"""Share of an unknown's information that must be its own, not explained by the others; rounding leaves about 1e-15."""
+LEAST_EIGENVALUE = 2e-14
+"""Of the normal matrix scaled to unit diagonal before points are eliminated; rounding leaves about 1e-15."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -172,9 +172,23 @@ def factor_dense(reduced: Reduced, damping: float, datum: "InnerDatum | None") -
     scale = 1.0 / np.sqrt(diagonal)
     matrix *= scale * scale[:, None]
     cholesky, info = linalg.lapack.dpotrf(matrix, lower=1, clean=1)
-    if info != 0 or np.min(np.diag(cholesky)) ** 2 < LEAST_PIVOT:
+    if info != 0 or least_eigenvalue(cholesky) < LEAST_EIGENVALUE:
         raise AdjustmentError(describe_defect(reduced, matrix))
     return DenseFactor(reduced=reduced, cholesky=cholesky, scale=scale, null_space=free)
+
+
+def least_eigenvalue(cholesky: Array) -> float:
+    """Return an estimate, rather too large, of the least eigenvalue, by inverse iteration with a Cholesky factor.
+
+    The factor's own diagonal would not show it: a defect may be spread over all pivots.
+    """
+    vector = np.cos(np.arange(1.0, len(cholesky) + 1.0))
+    eigenvalue = np.inf
+    for _ in range(4):
+        vector /= np.linalg.norm(vector)
+        vector = linalg.cho_solve((cholesky, True), vector, check_finite=False)
+        eigenvalue = 1.0 / max(float(np.linalg.norm(vector)), 1e-300)
+    return eigenvalue
 
 
 def name_unknown(reduced: Reduced, index: int) -> str:

@@ -103,8 +103,8 @@ def intersect_robustly(
 ) -> None:
     """Write better positions of the chosen points first to last: the best pair of rays.
 
-    Of all pairs that one is best which most other rays support. The scales, (m,), are those of normalised misclosures at the
-    present orientations. A point keeps its position where no pair of rays gives a smaller cost.
+    Of all pairs that one is best which most other rays support. The scales, (m,), are of normalised misclosures at
+    the present orientations. A point keeps its position where no pair of rays gives a smaller cost.
     """
     most = 1
     for p in range(first, last):
