@@ -18,6 +18,8 @@ CELL_M = 0.025
 """Between the nodes of the height grid."""
 COARSE = 8
 """Nodes of the height grid in a coarse cell (20 cm), over which steepness and the highest surface are bounded."""
+STEEP = 0.95
+"""Below this gradient a ray down to 46 degrees off nadir meets the surface once."""
 MATERIAL_CELL_M = 0.2
 TILE_CELL_M = 0.002
 SIGNAL_RADIUS_M = 0.15
@@ -127,13 +129,13 @@ def first_hit(
 
     ``start`` is a near guess, or 0. Where the ground is gentle the ray meets it once and Newton's method finds it;
     where something steep is near enough to hide the ground, the ray is followed from above the highest surface around.
-    Good to 0.01 mm. The flag says that the ground is gentle all around. bounds: as in ``Ground``.
+    Good to 0.01 mm. The flag says that the ground is gentle there. bounds: as in ``Ground``.
     """
     dx, dy = ray
     reach = np.sqrt(dx * dx + dy * dy)
     depth = start
     if depth <= 0.0:
-        return _march(heights_m, centre, ray, centre[2] - np.float64(bounds[:, :, 1].max()), 9.0), False
+        return _march(heights_m, bounds, centre, ray, centre[2] - np.float64(bounds[:, :, 1].max())), False
     settled = False
     x, y, h = centre[0], centre[1], 0.0
     for _ in range(12):
@@ -144,9 +146,7 @@ def first_hit(
             settled = True
             break
         depth += gap / max(1.0 + slope_along * dx + slope_across * dy, 0.3)
-    rows, columns, _ = bounds.shape
-    i = min(max(int((x / CELL_M + 0.5 * (heights_m.shape[1] - 1)) / COARSE), 0), columns - 1)
-    j = min(max(int((y / CELL_M + 0.5 * (heights_m.shape[0] - 1)) / COARSE), 0), rows - 1)
+    j, i = _coarse_cell(heights_m, bounds, x, y)
     top = np.float64(bounds[j, i, 1])
     away = (top - h) * reach  # nothing farther than this can hide the place
     if settled and away < 1.0:
@@ -154,26 +154,41 @@ def first_hit(
         away = (top - h) * reach
     if settled and bounds[j, i, 0] > away:
         return depth, True
-    return _march(heights_m, centre, ray, centre[2] - top, np.float64(bounds[j, i, 3])), False
+    met = _march(heights_m, bounds, centre, ray, centre[2] - top)
+    return met, settled and abs(met - depth) < 1e-3 and bounds[j, i, 3] < STEEP
+
+
+@inlined
+def _coarse_cell(heights_m: Field, bounds: Field, x: float, y: float) -> tuple[int, int]:
+    """Row and column of the coarse cell at a place, the nearest one beyond the site."""
+    rows, columns, _ = bounds.shape
+    i = int((x / CELL_M + 0.5 * (heights_m.shape[1] - 1)) / COARSE)
+    j = int((y / CELL_M + 0.5 * (heights_m.shape[0] - 1)) / COARSE)
+    return min(max(j, 0), rows - 1), min(max(i, 0), columns - 1)
 
 
 @kernel
-def _march(heights_m: Field, centre: Array, ray: tuple[float, float], depth: float, steepest: float) -> float:
+def _march(heights_m: Field, bounds: Field, centre: Array, ray: tuple[float, float], depth: float) -> float:
     """Follow a ray down from above the surface, then close in (Illinois method).
 
-    A step is as long as the steepest gradient around allows, and at least half a node.
+    A step reaches one coarse cell at most, as far as the highest surface or the steepest gradient of the cells around
+    leave the ray free, and half a node at least.
     """
     dx, dy = ray
     reach = np.sqrt(dx * dx + dy * dy)
-    least = 0.0125 / max(reach, 0.05)
-    gap = centre[2] - depth - height_and_gradient(heights_m, centre[0] + depth * dx, centre[1] + depth * dy)[0]
+    least, most = 0.5 * CELL_M / max(reach, 0.05), CELL_M * (COARSE - 1) / max(reach, 0.001)
+    x, y = centre[0] + depth * dx, centre[1] + depth * dy
+    gap = centre[2] - depth - height_and_gradient(heights_m, x, y)[0]
     above, gap_above = depth, max(gap, 0.0)
     for _ in range(100_000):
         if gap < 0.0:
             break
         above, gap_above = depth, gap
-        depth += max(gap / (1.0 + steepest * reach), least)
-        gap = centre[2] - depth - height_and_gradient(heights_m, centre[0] + depth * dx, centre[1] + depth * dy)[0]
+        j, i = _coarse_cell(heights_m, bounds, x, y)
+        free = max(gap / (1.0 + bounds[j, i, 3] * reach), centre[2] - depth - bounds[j, i, 4])
+        depth += max(min(free, most), least)
+        x, y = centre[0] + depth * dx, centre[1] + depth * dy
+        gap = centre[2] - depth - height_and_gradient(heights_m, x, y)[0]
     below, gap_below = depth, gap
     for _ in range(60):
         if gap_above - gap_below <= 0.0:
@@ -195,7 +210,7 @@ def hits(heights_m: Field, bounds: Field, centre: Array, rays: Array) -> Array:
     depths = np.empty(rays.shape[0])
     above = centre[2] - np.float64(bounds[:, :, 1].max())
     for n in range(rays.shape[0]):
-        depths[n] = _march(heights_m, centre, (rays[n, 0], rays[n, 1]), above, 9.0)
+        depths[n] = _march(heights_m, bounds, centre, (rays[n, 0], rays[n, 1]), above)
     return depths
 
 

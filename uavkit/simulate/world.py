@@ -24,6 +24,7 @@ from uavkit.simulate.kernels import (
     COARSE,
     MATERIAL_CELL_M,
     SIGNAL_RADIUS_M,
+    STEEP,
     Field,
     cast_shadows,
     surface_heights,
@@ -42,8 +43,6 @@ CREST_HALF_WIDTH_M = 3.0
 SUN_AZIMUTH_RAD = float(np.radians(-70.0))
 """From the axis ``along``, towards ``across``."""
 SUN_ELEVATION_RAD = float(np.radians(50.0))
-STEEP = 0.95
-"""Below this gradient a ray down to 46 degrees off nadir meets the surface once."""
 
 
 class Ground(NamedTuple):
@@ -52,8 +51,8 @@ class Ground(NamedTuple):
     heights_m: Field
     """(rows, columns): rows run across, columns along."""
     bounds: Field
-    """(coarse rows, coarse columns, 4): distance to the nearest gradient above ``STEEP`` (rather too small), highest
-    surface within 3 m and within 1 m, steepest gradient within 3 m."""
+    """(coarse rows, coarse columns, 5): distance to the nearest gradient above ``STEEP`` (rather too small), highest
+    surface within 3 m and within 1 m; steepest gradient and highest surface of the cell and its eight neighbours."""
     radiance: Field
     """Mean of red, green and blue without fine detail; its mip levels one after another, flat."""
     levels: NDArray[np.int64]
@@ -204,8 +203,9 @@ def _bounds(heights: Field) -> Field:
     distance = ndimage.distance_transform_edt(steepest <= STEEP) * COARSE * CELL_M
     highest = heights.reshape(blocks).max(axis=(1, 3))
     clearance = np.maximum(distance - 1.5 * COARSE * CELL_M, 0.0)
-    tops = [ndimage.maximum_filter(highest, size) for size in (31, 13)]
-    return np.stack([clearance, *tops, ndimage.maximum_filter(steepest, 31) * 1.01], axis=-1).astype(np.float32)
+    far, near, here = (ndimage.maximum_filter(highest, size) for size in (31, 13, 3))
+    slope = ndimage.maximum_filter(steepest, 3) * 1.01
+    return np.stack([clearance, far, near, slope, here + 1e-5], axis=-1).astype(np.float32)
 
 
 def _materials(rng: np.random.Generator) -> tuple[NDArray[np.uint8], Array]:
