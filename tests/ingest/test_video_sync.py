@@ -162,7 +162,7 @@ def test_a_still_that_cannot_be_decoded_is_named_and_shifts_nothing():
     stills = MemoryStills(made.stills.infos, made.stills.pictures, broken={"R002.jpg"})
     outcome = synchronise(stills, stills.infos, made.video())
     assert len(check_places(outcome, made)) == 6
-    assert any("R002.jpg cannot be read" in note for note in outcome.notes)
+    assert any("R002.jpg has no place in the video" in note for note in outcome.notes)
 
 
 def test_events_are_told_to_the_field():

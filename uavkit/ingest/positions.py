@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from uavkit.core.arrays import Array
+from uavkit.core.arrays import Array, Flags
 from uavkit.core.frames import LocalFrame
 from uavkit.core.records import GnssFix, StillInfo
 from uavkit.ingest.sequence_alignment import (
@@ -25,14 +25,25 @@ from uavkit.ingest.sequence_alignment import (
     no_clock,
 )
 
-LOG_LEFT_OUT = -3.0
-"""Logarithm of the weight of a still without position, or a position without still, where the counts differ."""
-LOG_LEFT_OUT_EQUAL = -9.0
-"""The same where the counts are equal: then order is right but for strong contradictions."""
+LOG_LEFT_OUT = -9.0
+"""Logarithm of the weight of a still without position, or a position without still, in the midst of the flight."""
+LOG_LEFT_OUT_END = -5.0
+"""The same before the first and after the last pair: places of take-off and landing are often listed."""
 LONGEST_SKIP = 4
 """Stills or positions that may be missing one after another."""
 STRAY_SHARE = 0.12
-"""Steps that tell nothing: an outlier at one end, a turn, a wait."""
+"""Steps that tell nothing: an outlier at one end, a wait; their lengths are spread evenly over ``STRAY_M``."""
+STRAY_M = 60.0
+LONG_PAUSE = 0.6
+"""A time between stills longer than usual by this share of the usual one is that of a turn, if the path has turns."""
+TURN_RAD = 0.9
+LOG_TURN = (2.0, -3.0, -1.5)
+"""Weights of a long pause at a turn of the path, of one elsewhere, and of a turn without a pause."""
+LEAST_FOR_ORDER = 0.51
+"""Probability of each pair from which equal counts are joined by order."""
+CERTAIN = 0.9995
+APART = 6.0
+"""Steps longer than this many usual ones lead to no exposure, at the ends of a list; outliers are nearer."""
 FAR_M = 20_000.0
 """Positions this far from the median of all are none of this flight."""
 
@@ -46,7 +57,7 @@ class PositionOptions:
     sigma_vertical_m: float = 2.0
     exif_sigma_horizontal_m: float = 1.5
     exif_sigma_vertical_m: float = 3.0
-    wanted_probability: float = 0.99
+    wanted_probability: float = 0.997
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -191,13 +202,29 @@ def _align(slots: Sequence[_Slot], fixes: Sequence[GnssFix], options: PositionOp
     own = [slot.info.position if slot.info is not None else None for slot in slots]
     if sum(fix is not None for fix in own) >= 2:
         return align_by_order(_nearness(own, fixes), settings), "EXIF positions"
-    matrix = _step_probabilities(stills_s, _east_north(fixes) if fixes else np.zeros((0, 2)), len(slots))
-    return _decided(matrix, options), "order and distances" if stills_s is not None else "order"
+    place_m = _east_north(fixes) if fixes else np.zeros((0, 2))
+    matrix = _step_probabilities(stills_s, place_m, len(slots))
+    return _decided(matrix, place_m, options), "order and distances" if stills_s is not None else "order"
 
 
-def _decided(matrix: Array, options: PositionOptions) -> SequenceAlignment:
-    """Cut a matrix of probabilities into pairs and what is left open."""
-    return decide(matrix, no_clock(), AlignmentOptions(wanted_probability=options.wanted_probability))
+def _decided(matrix: Array, place_m: Array, options: PositionOptions) -> SequenceAlignment:
+    """Cut a matrix of probabilities into pairs and what is left open.
+
+    Where the counts are equal, order is taken unless something else is likelier. Where the first or the last position
+    lies far apart like a place of take-off, another one may be missing, and order must be all but certain.
+    """
+    wanted = options.wanted_probability
+    n, m = matrix.shape
+    if n == m and n:
+        wanted = CERTAIN if _end_apart(place_m) else wanted
+        if float(np.diag(matrix).min()) > LEAST_FOR_ORDER and not _end_apart(place_m):
+            wanted = LEAST_FOR_ORDER
+    return decide(matrix, no_clock(), AlignmentOptions(wanted_probability=wanted))
+
+
+def _end_apart(place_m: Array) -> bool:
+    steps_m = np.linalg.norm(np.diff(place_m, axis=0), axis=1)
+    return len(steps_m) > 2 and max(steps_m[0], steps_m[-1]) > APART * float(np.median(steps_m))
 
 
 def _still_times(slots: Sequence[_Slot]) -> Array | None:
@@ -225,16 +252,15 @@ def _step_probabilities(stills_s: Array | None, place_m: Array, stills: int) -> 
     """Return the probability (n, m) of each pair from the order and from distances against intervals.
 
     All chains of pairs are weighed (forward and backward): each step from one pair to the next by how well the distance
-    fits the interval, each still or position that is left out by a fixed weight.
+    fits, each still or position that is left out by a fixed weight.
     """
     n, m = stills, len(place_m)
     if min(n, m) == 0:
         return np.zeros((n, m))
-    left_out = LOG_LEFT_OUT_EQUAL if n == m else LOG_LEFT_OUT
     step = _log_steps(stills_s, place_m, n)
-    ends = np.asarray(left_out * (np.arange(n)[:, None] + np.arange(m)[None, :]), dtype=np.float64)
-    forward = _chain(step, ends, left_out)
-    turned = _chain(_reversed_steps(step, n, m), ends, left_out)[::-1, ::-1]
+    ends = np.asarray(LOG_LEFT_OUT_END * (np.arange(n)[:, None] + np.arange(m)[None, :]), dtype=np.float64)
+    forward = _chain(step, ends)
+    turned = _chain(_reversed_steps(step, n, m), ends)[::-1, ::-1]
     total = forward + ends[::-1, ::-1]
     peak = float(total.max())
     log_sum = peak + np.log(np.exp(total - peak).sum())
@@ -255,7 +281,7 @@ def _reversed_steps(step: _Steps, n: int, m: int) -> _Steps:
     return result
 
 
-def _chain(step: _Steps, ends: Array, left_out: float) -> Array:
+def _chain(step: _Steps, ends: Array) -> Array:
     """Return (n, m) the log sum over all chains that lead to each pair, that pair included."""
     n, m = ends.shape
     sums = ends.copy()
@@ -264,7 +290,7 @@ def _chain(step: _Steps, ends: Array, left_out: float) -> Array:
             terms = [sums[i, j]]
             for (di, dj), weight in step.items():
                 if di <= i and dj <= j:
-                    terms.append(sums[i - di, j - dj] + weight[i - di, j - dj] + left_out * (di + dj - 2))
+                    terms.append(sums[i - di, j - dj] + weight[i - di, j - dj] + LOG_LEFT_OUT * (di + dj - 2))
             values = np.array(terms)
             peak = values.max()
             sums[i, j] = peak + np.log(np.exp(values - peak).sum())
@@ -272,27 +298,80 @@ def _chain(step: _Steps, ends: Array, left_out: float) -> Array:
 
 
 def _log_steps(stills_s: Array | None, place_m: Array, n: int) -> _Steps:
-    """Return how well each step fits: distance against interval times the usual speed, heavy tails for outliers.
+    """Return how well each step fits: its length against the usual spacing, or against the interval times the usual
+    speed; heavy tails for outliers; pauses of the stills against turns of the path.
 
-    The weight of a step that fits is about 0; the worst is log of ``STRAY_SHARE``.
+    A still and a position are never left out side by side: an outlier is no reason to leave both out.
     """
     m = len(place_m)
-    usual_m = float(np.median(np.linalg.norm(np.diff(place_m, axis=0), axis=1))) if m > 1 else 0.0
-    steps = {}
+    steps_m = np.linalg.norm(np.diff(place_m, axis=0), axis=1)
+    usual_m = float(np.median(steps_m)) if m > 1 else 0.0
+    spread_m = max(1.48 * float(np.median(np.abs(steps_m - usual_m))) if m > 1 else 0.0, 0.1 * usual_m, 1.0)
+    pace, pauses = _pace(stills_s, n)
+    turns, known = _turns(place_m, np.abs(steps_m - usual_m) > 3.5 * spread_m)
+    if not 1 <= int(pauses.sum()) <= int(turns.sum()):
+        known = np.zeros_like(known)
+    result = {}
     for di in range(1, min(LONGEST_SKIP, n - 1) + 1):
         for dj in range(1, min(LONGEST_SKIP, m - 1) + 1):
             weight = np.full((n, m), -np.inf)
-            if stills_s is None or usual_m <= 0.0:
-                weight[: n - di, : m - dj] = 0.0
-            else:
-                usual_s = float(np.median(np.diff(stills_s)))
-                expected = (stills_s[di:] - stills_s[:-di]) / max(usual_s, 1e-9) * usual_m
-                distance = np.linalg.norm(place_m[dj:] - place_m[:-dj], axis=1)
-                spread = 0.25 * usual_m + 1.5
-                fit = np.exp(-0.5 * ((distance[None, :] - expected[:, None]) / spread) ** 2)
-                weight[: n - di, : m - dj] = np.log((1.0 - STRAY_SHARE) * fit + STRAY_SHARE)
-            steps[di, dj] = weight
-    return steps
+            if di != dj or di == 1:
+                distance = np.linalg.norm(place_m[dj:] - place_m[:-dj], axis=1)[None, :]
+                fit = _normal(distance - di * usual_m, spread_m)
+                if pace is not None:
+                    expected = (pace[di:] - pace[:-di])[:, None] * usual_m
+                    fit = 0.5 * fit + 0.5 * _normal(distance - expected, spread_m + 0.25 * usual_m)
+                log_fit = np.log((1.0 - STRAY_SHARE) * fit + STRAY_SHARE / STRAY_M)
+                weight[: n - di, : m - dj] = log_fit + _turn_weights(
+                    _any_of(pauses, di), _any_of(turns, dj), ~_any_of(~known, dj)
+                )
+            result[di, dj] = weight
+    return result
+
+
+def _normal(residual: Array, sigma: float) -> Array:
+    return np.asarray(np.exp(-0.5 * (residual / sigma) ** 2) / (sigma * np.sqrt(2.0 * np.pi)))
+
+
+def _pace(stills_s: Array | None, n: int) -> tuple[Array | None, Flags]:
+    """Return times in units of the usual interval, pauses taken out, shape (n,), and which intervals (n - 1,) are
+    pauses."""
+    if stills_s is None:
+        return None, np.zeros(max(n - 1, 0), dtype=np.bool_)
+    intervals = np.diff(stills_s)
+    usual = max(float(np.median(intervals)), 1e-9)
+    pauses = intervals > (1.0 + LONG_PAUSE) * usual
+    return np.concatenate([[0.0], np.cumsum(np.where(pauses, usual, intervals) / usual)]), pauses
+
+
+def _turns(place_m: Array, stray: Flags) -> tuple[Flags, Flags]:
+    """Return which steps (m - 1,) of the path lead from one strip to the next, across what comes before and after, and
+    of which that can be told: not near outliers, positions between two stray steps."""
+    m = len(place_m)
+    turns, known = np.zeros(max(m - 1, 0), dtype=np.bool_), np.zeros(max(m - 1, 0), dtype=np.bool_)
+    outlier = np.concatenate([[False], stray[1:] & stray[:-1], [False]]) if m > 1 else np.zeros(m, dtype=np.bool_)
+    for j in range(2, m - 3):
+        step, before, after = place_m[j + 1] - place_m[j], place_m[j] - place_m[j - 2], place_m[j + 3] - place_m[j + 1]
+        turns[j] = all(_angle_rad(step, other) > TURN_RAD for other in (before, after))
+        known[j] = not outlier[[j - 2, j, j + 1, j + 3]].any()
+    return turns & known, known
+
+
+def _angle_rad(one: Array, two: Array) -> float:
+    """Angle between two directions in the plane, 0 to pi."""
+    return float(abs(np.arctan2(one[0] * two[1] - one[1] * two[0], one @ two)))
+
+
+def _any_of(flags: Flags, count: int) -> Flags:
+    """Return for each window of ``count`` flags whether one of them is set."""
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(flags, count).any(axis=1), dtype=np.bool_)
+
+
+def _turn_weights(pauses: Flags, turns: Flags, known: Flags) -> Array:
+    pause, turn = pauses[:, None], turns[None, :]
+    both, alone, without = LOG_TURN
+    weight = np.where(pause & turn, both, np.where(pause, alone, np.where(turn, without, 0.0)))
+    return np.asarray(np.where(known[None, :], weight, 0.0))
 
 
 def _count_notes(
