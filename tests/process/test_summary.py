@@ -7,6 +7,7 @@ import pytest
 
 from tests.process import test_network as small
 from tests.process.made_blocks import FULL, MadeStills, block_of, stations, still_names
+from uavkit.core.adjustment import Datum
 from uavkit.core.arrays import Array
 from uavkit.core.points import PointKind
 from uavkit.core.result import OrientedBlock, PointOrigin
@@ -64,7 +65,7 @@ def _stills() -> MadeStills:
 
 
 def _summarised(
-    missing: tuple[int, ...] = (), candidates: Candidates = small.CANDIDATES
+    missing: tuple[int, ...] = (), candidates: Candidates = small.CANDIDATES, datum: Datum | None = None
 ) -> tuple[OrientedBlock, Findings]:
     rng = np.random.default_rng(12)
     block = replace(
@@ -73,7 +74,7 @@ def _summarised(
     )
     marked = marked_points(block)
     network = network_of(small._growing(missing), candidates, marked)
-    adjusted = adjust_network(network, block, marked, AdjustmentSection(), None)
+    adjusted = adjust_network(network, block, marked, AdjustmentSection(), datum)
     found = Findings(
         block=block, reasons={row: "blurred" for row in missing}, candidates=candidates, tied=candidates,
         network=network, marked=marked, adjusted=adjusted,
@@ -202,3 +203,11 @@ def test_unoriented_stills_are_named_with_their_reasons() -> None:
     assert result.unoriented == {"S001.JPG": "blurred", "S006.JPG": "blurred"}
     assert result.images == tuple(n for n in still_names(8) if n not in result.unoriented)
     assert len(result.strips) == 6
+
+
+def test_a_free_network_is_not_compared_with_a_survey() -> None:
+    """Its axes and scale are the model's own: differences of coordinates would mean nothing."""
+    result, _ = _summarised(datum=Datum.FREE_NETWORK)
+    assert (result.control, result.check) == ((), ())
+    assert result.check_covariance_m2.shape == (0, 0)
+    assert PointKind.CHECK in result.point_kinds

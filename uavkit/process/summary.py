@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from uavkit.core.adjustment import Datum
 from uavkit.core.arrays import Array, Indices
 from uavkit.core.block import Block
 from uavkit.core.devices import StillSource
@@ -132,6 +133,8 @@ def _differences(found: Findings, gsd: Array, kind: PointKind) -> tuple[tuple[Po
     rays = np.bincount(adjusted.rays.point_index[result.ray_used], minlength=len(result.points_m))
     rows = np.flatnonzero((adjusted.points >= marks_from + span[0]) & (adjusted.points < marks_from + span[1]))
     rows = rows[np.isfinite(result.points_m[rows, 0]) & (rays[rows] > 0)]
+    if result.datum is Datum.FREE_NETWORK:  # the model's own axes and scale: nothing to compare with a survey
+        rows = rows[:0]
     joint = _joint_covariance(adjusted, rows)
     differences = []
     for number, row in enumerate(rows.tolist()):
