@@ -61,6 +61,13 @@ def test_with_positions_the_nearest_are_compared() -> None:
     assert pairs == sorted(set(pairs))
 
 
+def test_stills_of_one_position_are_compared_with_each_other_not_with_themselves() -> None:
+    positions = np.array([[0.0, 0, 15], [50.0, 0, 15], [100.0, 0, 15], [150.0, 0, 15], [0.0, 0, 15]])
+    pairs = pairs_to_compare(5, positions, 1)
+    assert (0, 4) in pairs
+    assert all(i < j for i, j in pairs)
+
+
 def test_a_still_without_position_is_compared_with_all() -> None:
     positions = np.array([[100.0 * n, 0, 15] for n in range(8)])
     positions[3] = np.nan

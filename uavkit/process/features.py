@@ -113,8 +113,9 @@ def pairs_to_compare(count: int, positions_m: Array | None, neighbours: int) -> 
     if positions_m is not None:
         rows = np.flatnonzero(known)
         for i in rows.tolist():
-            distance = np.linalg.norm(positions_m[rows] - positions_m[i], axis=1)
-            nearest = rows[np.argsort(distance, kind="stable")[1 : neighbours + 1]]
+            others = rows[rows != i]
+            distance = np.linalg.norm(positions_m[others] - positions_m[i], axis=1)
+            nearest = others[np.argsort(distance, kind="stable")[:neighbours]]
             pairs |= {(min(i, j), max(i, j)) for j in nearest.tolist()}
     for i in np.flatnonzero(~known).tolist():
         reach = count if count <= _EXHAUSTIVE_UP_TO else neighbours
