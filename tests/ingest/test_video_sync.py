@@ -92,19 +92,18 @@ def test_the_event_of_a_removed_still_is_named(removed):
 
 
 def test_lost_event_false_event_and_shifted_clock_together():
-    made = make_flight(seed=8, clock_offset_s=-86_400.37)
+    made = make_flight(seed=8, stations=6, clock_offset_s=-86_400.37)
     damaged = made.without_event(2).with_false_event(made.first_frame[4] + 8, length=6)
     outcome = sync(made, damaged.video())
-    places = check_places(outcome, made)
-    assert len(places) >= 6
+    assert len(check_places(outcome, made)) >= 5
     assert len(outcome.sync.events_without_still) == 1
 
 
-@pytest.mark.parametrize("lost", [0, 6])
+@pytest.mark.parametrize("lost", [0, 4])
 def test_regular_intervals_are_settled_by_content(lost):
-    made = flight(seed=5, gap=(45, 45))
+    made = flight(seed=5, gap=(40, 40), stations=5)
     outcome = sync(made, made.without_event(lost).video())
-    assert len(check_places(outcome, made)) >= 6
+    assert len(check_places(outcome, made)) >= 4
 
 
 def test_stills_without_times_are_settled_by_content():
@@ -115,9 +114,9 @@ def test_stills_without_times_are_settled_by_content():
 
 
 def test_frozen_pictures_without_black_are_events():
-    made = make_flight(seed=6, black=None)
+    made = make_flight(seed=6, black=None, stations=5)
     outcome = sync(made)
-    assert len(check_places(outcome, made, tolerance_frames=1)) == 7
+    assert len(check_places(outcome, made, tolerance_frames=2)) == 5
     assert {place.kind for place in outcome.sync.places} == {"frozen"}
 
 

@@ -20,6 +20,8 @@ from uavkit.core.records import StillInfo
 from uavkit.core.video import AffineTransformation
 
 FEATURES = 700
+FEW_FEATURES = 300
+"""Where hundreds of pictures are searched."""
 LEAST_MATCHES = 10
 GREATEST_SHIFT = 0.15
 """Of the finder's picture against the middle of the still, as a share of its width."""
@@ -70,19 +72,19 @@ class Features:
     """(n, 128), of length 1."""
 
 
-def _features(picture: Image) -> tuple[Array, NDArray[np.float32]]:
+def _features(picture: Image, most: int) -> tuple[Array, NDArray[np.float32]]:
     import cv2
 
-    points, descriptors = cv2.SIFT_create(nfeatures=FEATURES).detectAndCompute(picture, None)  # type: ignore[attr-defined,unused-ignore]
+    points, descriptors = cv2.SIFT_create(nfeatures=most).detectAndCompute(picture, None)  # type: ignore[attr-defined,unused-ignore]
     if descriptors is None or len(points) == 0:
         return np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32)
     length = np.linalg.norm(descriptors, axis=1, keepdims=True)
     return np.array([point.pt for point in points], dtype=np.float64), (descriptors / length).astype(np.float32)
 
 
-def features_of_field(picture: FieldPicture) -> Features:
+def features_of_field(picture: FieldPicture, most: int = FEATURES) -> Features:
     """Return the points of interest of a field in frame coordinates."""
-    xy, descriptors = _features(picture.square())
+    xy, descriptors = _features(picture.square(), most)
     return Features(xy=picture.frame_from_square(xy), descriptors=descriptors)
 
 
@@ -113,7 +115,7 @@ def reduce_still(grey: Image, video_width_px: int) -> ReducedStill:
 
 def features_of_still(reduced: ReducedStill) -> Features:
     """Return the points of interest of a still in still pixels."""
-    xy, descriptors = _features(reduced.grey)
+    xy, descriptors = _features(reduced.grey, FEATURES)
     return Features(xy=reduced.still_coordinates(xy), descriptors=descriptors)
 
 

@@ -33,6 +33,7 @@ from uavkit.ingest.shutter_events import (
     scan_video,
 )
 from uavkit.ingest.still_matching import (
+    FEW_FEATURES,
     ContentMatch,
     Features,
     FieldPicture,
@@ -484,7 +485,8 @@ def _sampled_features(scene: _Scene, span: tuple[int, int], progress: Progress) 
     features = {}
     for frame in scene.video.frames(*span):
         if (frame.index - span[0]) % step == 0 and not frame.damaged:
-            features[frame.index] = features_of_field(field_picture(frame.luminance, 0, scene.row_step))
+            picture = field_picture(frame.luminance, 0, scene.row_step)
+            features[frame.index] = features_of_field(picture, FEW_FEATURES)
             progress("read video again", frame.index - span[0], span[1] - span[0] + 1)
     return features
 
