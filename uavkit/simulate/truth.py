@@ -41,6 +41,7 @@ def survey_truth(scene: "Scene", finder: "Finder | None") -> dict[str, Any]:
         "gnss": {
             "shift_m": scene.waypoints.shift_m.tolist(),
             "outliers": [scene.names[n] for n in scene.waypoints.outliers],
+            "outlier_indexes": scene.waypoints.outliers.tolist(),
             "lever_arm_m": [0.0, 0.0, 0.0],
         },
         "video": None if finder is None else _video(finder),
