@@ -26,7 +26,7 @@ from uavkit.process.features import (
 )
 from uavkit.process.measurement import measure_rays
 from uavkit.process.options import CandidateOptions, MeasurementOptions
-from uavkit.process.pictures import PictureStore
+from uavkit.process.pictures import PictureStore, PyramidStore
 
 OPTIONS = CandidateOptions(feature_width_px=800, features=800)
 
@@ -245,7 +245,9 @@ def test_features_of_turned_stills_are_matched_and_measured(turn_deg: float, hei
         )
         error = np.abs((moved - truth) / step - tasks.warps[:, :, axis])
         assert np.median(error) < 0.06  # a similarity for all, of single features' angles and sizes
-    rays = measure_rays(store, tasks, MeasurementOptions(window_px=21), workers=1, progress=silent, stage="")
+    rays = measure_rays(
+        PyramidStore(store), tasks, MeasurementOptions(window_px=21), workers=1, progress=silent, stage=""
+    )
     assert rays.ok.mean() > 0.8
     error = np.linalg.norm(rays.target_px - truth, axis=1)[rays.ok]
     assert np.median(error) < 0.06

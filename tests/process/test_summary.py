@@ -14,9 +14,8 @@ from uavkit.core.result import OrientedBlock, PointOrigin
 from uavkit.process.candidates import Candidates
 from uavkit.process.network import adjust_network, marked_points, network_of
 from uavkit.process.options import AdjustmentSection
-from uavkit.process.pictures import PictureStore
+from uavkit.process.pictures import PictureStore, PyramidStore
 from uavkit.process.summary import Findings, strips_of, summarise
-from uavkit.process.tie_points import PyramidStore
 
 
 def _centres(strips: int, per_strip: int, base_m: float, apart_m: float) -> Array:

@@ -13,10 +13,9 @@ from uavkit.core.orientation import ExteriorOrientation
 from uavkit.core.progress import silent
 from uavkit.process.measurement import RayTasks
 from uavkit.process.options import MeasurementOptions
-from uavkit.process.pictures import PictureStore
+from uavkit.process.pictures import PictureStore, PyramidStore
 from uavkit.process.tie_points import (
     ObjectGeometry,
-    PyramidStore,
     TiePointMatching,
     surface_normals,
     visible_tasks,
@@ -172,7 +171,7 @@ def pictured() -> tuple[MadeStills, Ground]:
 def _matching(stills: MadeStills, workers: int = 1) -> TiePointMatching:
     store = PictureStore(stills, tuple(stills.pictures))
     return TiePointMatching(
-        store=store, pyramids=PyramidStore(store), options=MeasurementOptions(window_px=21), workers=workers,
+        pyramids=PyramidStore(store), options=MeasurementOptions(window_px=21), workers=workers,
         progress=silent,
     )  # fmt: skip
 

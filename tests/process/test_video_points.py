@@ -17,8 +17,7 @@ from uavkit.core.records import FieldOrder, VideoFrame, VideoInfo
 from uavkit.core.result import PointOrigin
 from uavkit.core.video import AffineTransformation
 from uavkit.process.options import CandidateOptions, MeasurementOptions
-from uavkit.process.pictures import PictureStore
-from uavkit.process.tie_points import PyramidStore
+from uavkit.process.pictures import PictureStore, PyramidStore
 from uavkit.process.video_points import (
     LEAST_THROUGH_VIDEO,
     VideoInput,

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uavkit.core.arrays import Array, Flags, Indices
+from uavkit.core.arrays import Array, Flags, Image, Indices
 from uavkit.core.progress import Progress
 from uavkit.process.least_squares_matching import MatchingOptions, MatchingStatus, match_forward_backward, ray_sigma
 from uavkit.process.options import MeasurementOptions
-from uavkit.process.pictures import PictureStore
+from uavkit.process.pictures import PyramidStore
+from uavkit.process.pyramid import full_from_level, level_from_full
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,37 +73,65 @@ def pairs_of(tasks: RayTasks) -> list[tuple[int, int, Indices]]:
 
 
 def measure_rays(
-    store: PictureStore, tasks: RayTasks, options: MeasurementOptions, *, workers: int, progress: Progress, stage: str
+    pyramids: PyramidStore,
+    tasks: RayTasks,
+    options: MeasurementOptions,
+    *,
+    workers: int,
+    progress: Progress,
+    stage: str,
 ) -> MeasuredRays:
-    """Match every task forward and backward; rows keep their order, results the same bits with any workers."""
+    """Match every task forward and backward; rows keep their order, results the same bits with any workers.
+
+    What fails in the still itself is tried once more in the still at half its size, with twice the sigma: foliage and
+    relief that do not correlate pixel by pixel often do so there.
+    """
     settings = MatchingOptions(
         window_px=options.window_px,
         least_correlation=options.least_correlation,
         most_return_miss_px=options.most_return_miss_px,
     )
     k = len(tasks)
-    target_px, sigma_px, warps = np.full((k, 2), np.nan), np.full((k, 2), np.nan), np.full((k, 2, 2), np.nan)
-    status = np.full(k, int(MatchingStatus.LEFT_IMAGE), dtype=np.int64)
+    rays = MeasuredRays(
+        ok=np.zeros(k, dtype=bool),
+        target_px=np.full((k, 2), np.nan),
+        warps=np.full((k, 2, 2), np.nan),
+        sigma_px=np.full((k, 2), np.nan),
+        status=np.full(k, int(MatchingStatus.LEFT_IMAGE), dtype=np.int64),
+    )
     pairs = pairs_of(tasks)
     for done, (reference, target, rows) in enumerate(pairs):
         progress(stage, done, len(pairs))
-        both = match_forward_backward(
-            store.grey(reference),
-            store.grey(target),
-            tasks.reference_px[rows],
-            tasks.start_px[rows],
-            tasks.warps[rows],
-            settings,
-            workers=workers,
-        )
-        forward = both.forward
-        target_px[rows], warps[rows], status[rows] = forward.target_px, forward.warps, forward.status
-        sigma_px[rows] = ray_sigma(forward, both.return_miss_px)
+        pictures = pyramids.get(reference).grey, pyramids.get(target).grey
+        for level in range(min(options.coarse_levels + 1, len(pictures[0]))):
+            left = rows[~rays.ok[rows]]
+            _measure_pair((pictures[0][level], pictures[1][level]), level, tasks, left, rays, settings, workers)
     progress(stage, len(pairs), len(pairs))
-    return MeasuredRays(
-        ok=np.asarray(status == MatchingStatus.OK),
-        target_px=target_px,
-        warps=warps,
-        sigma_px=sigma_px,
-        status=status,
+    return rays
+
+
+def _measure_pair(
+    pictures: tuple[Image, Image],
+    level: int,
+    tasks: RayTasks,
+    rows: Indices,
+    rays: MeasuredRays,
+    settings: MatchingOptions,
+    workers: int,
+) -> None:
+    """Match some tasks of a pair of stills on one level of their pyramids, and write what succeeds into ``rays``."""
+    both = match_forward_backward(
+        *pictures,
+        level_from_full(tasks.reference_px[rows], level),
+        level_from_full(tasks.start_px[rows], level),
+        tasks.warps[rows],
+        settings,
+        workers=workers,
     )
+    forward, ok = both.forward, both.forward.ok
+    good = rows[ok]
+    rays.target_px[good] = full_from_level(forward.target_px[ok], level)
+    rays.warps[good] = forward.warps[ok]
+    rays.sigma_px[good] = ray_sigma(forward, both.return_miss_px)[ok] * 2.0**level
+    rays.ok[good] = True
+    rays.status[rows] = forward.status

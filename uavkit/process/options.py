@@ -56,6 +56,8 @@ class MeasurementOptions:
     """Forward and backward matching may differ by this much, 0.02 to 2 px."""
     least_correlation: float = 0.75
     """Least correlation of the matched windows, 0.3 to 0.99."""
+    coarse_levels: int = 1
+    """How often a window that does not match is tried again in stills of half the size, 0 to 3."""
     most_search_px: int = 96
     """Largest radius of the search around a back-projected point, 4 to 400 px."""
 
@@ -65,6 +67,7 @@ class MeasurementOptions:
             raise InputError(f"option measurement.window_px must be odd, is {self.window_px}")
         _within("measurement.most_return_miss_px", self.most_return_miss_px, 0.02, 2.0)
         _within("measurement.least_correlation", self.least_correlation, 0.3, 0.99)
+        _within("measurement.coarse_levels", self.coarse_levels, 0, 3)
         _within("measurement.most_search_px", self.most_search_px, 4, 400)
 
 

@@ -35,10 +35,10 @@ from uavkit.process.network import (
     updated,
 )
 from uavkit.process.options import CandidateSource, ProcessOptions
-from uavkit.process.pictures import PictureStore
+from uavkit.process.pictures import PictureStore, PyramidStore
 from uavkit.process.ray_sigma import SigmaCalibration, calibrate_sigmas
 from uavkit.process.summary import Findings, peak_memory_mb, summarise
-from uavkit.process.tie_points import PyramidStore, TiePointMatching
+from uavkit.process.tie_points import TiePointMatching
 from uavkit.process.video_points import VideoInput, candidates_through_video
 
 _MOST_EXTRA_ROUNDS = 1
@@ -219,7 +219,7 @@ def _feature_candidates(place: Workplace, pairs: list[tuple[int, int]]) -> Candi
         return empty()
     with place.step("least squares matching"):
         rays = measure_rays(
-            place.store,
+            place.pyramids,
             tasks,
             options.measurement,
             workers=place.workers,
@@ -256,7 +256,6 @@ def _tie(
 ) -> tuple[Candidates, Network]:
     """Find every point in every still that should see it, twice: the second time with the better orientation."""
     matching = TiePointMatching(
-        store=place.store,
         pyramids=place.pyramids,
         options=place.options.measurement,
         workers=place.workers,

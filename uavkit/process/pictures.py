@@ -1,11 +1,13 @@
 """Grey values of the stills in use, a few at a time: memory does not grow with the number of stills."""
 
 from collections import OrderedDict
+from functools import lru_cache
 from threading import Lock
 
 from uavkit.core.arrays import Image
 from uavkit.core.devices import StillSource
 from uavkit.core.errors import InputError
+from uavkit.process.pyramid import ImagePyramid, build_pyramid
 
 
 class PictureStore:
@@ -42,3 +44,14 @@ class PictureStore:
     def fingerprint(self, index: int) -> str:
         """Return the hash of a still's content."""
         return self._source.fingerprint(self.names[index])
+
+
+class PyramidStore:
+    """Image pyramids of the stills in use, a few at a time."""
+
+    def __init__(self, store: PictureStore, capacity: int = 16, levels: int = 4) -> None:
+        self._build = lru_cache(maxsize=capacity)(lambda index: build_pyramid(store.grey(index), levels))
+
+    def get(self, index: int) -> ImagePyramid:
+        """Return the pyramid of a still by its row."""
+        return self._build(index)

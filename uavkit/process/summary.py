@@ -16,8 +16,8 @@ from uavkit.core.result import CandidateCount, CodePictures, OrientedBlock, Poin
 from uavkit.process.candidates import Candidates
 from uavkit.process.network import AdjustedNetwork, MarkedPoints, Network
 from uavkit.process.orientation_code import orientation_codes, richness
+from uavkit.process.pictures import PyramidStore
 from uavkit.process.pyramid import level_from_full
-from uavkit.process.tie_points import PyramidStore
 
 _TURN_COSINE = np.cos(np.radians(50.0))
 _PICTURE_LEVEL = 2

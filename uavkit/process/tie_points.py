@@ -7,7 +7,6 @@ matching.
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -23,8 +22,8 @@ from uavkit.process.candidates import Candidates
 from uavkit.process.measurement import RayTasks, measure_rays, pairs_of
 from uavkit.process.network import AdjustedNetwork
 from uavkit.process.options import MeasurementOptions
-from uavkit.process.pictures import PictureStore
-from uavkit.process.pyramid import ImagePyramid, PyramidOptions, build_pyramid, refine_through_pyramid
+from uavkit.process.pictures import PyramidStore
+from uavkit.process.pyramid import PyramidOptions, refine_through_pyramid
 
 _PROBE_PX = 8.0
 _MOST_OBLIQUE = np.cos(np.radians(72.0))
@@ -175,22 +174,10 @@ def _search_radii(geometry: ObjectGeometry, rows: Indices, image: int) -> Array:
     return np.asarray(3.0 * np.sqrt(np.linalg.eigvalsh(covariance)[:, 1]))
 
 
-class PyramidStore:
-    """Image pyramids of the stills in use, a few at a time."""
-
-    def __init__(self, store: PictureStore, capacity: int = 16, levels: int = 4) -> None:
-        self._build = lru_cache(maxsize=capacity)(lambda index: build_pyramid(store.grey(index), levels))
-
-    def get(self, index: int) -> ImagePyramid:
-        """Return the pyramid of a still by its row."""
-        return self._build(index)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TiePointMatching:
     """Finds candidates in all stills that should see them."""
 
-    store: PictureStore
     pyramids: PyramidStore
     options: MeasurementOptions
     workers: int
@@ -210,7 +197,7 @@ class TiePointMatching:
         tasks, found = self._search(tasks, radii)
         tasks, radii = tasks.where(found), radii[found]
         rays = measure_rays(
-            self.store, tasks, self.options, workers=self.workers, progress=self.progress, stage="tie points"
+            self.pyramids, tasks, self.options, workers=self.workers, progress=self.progress, stage="tie points"
         )
         near = np.linalg.norm(rays.target_px - tasks.start_px, axis=1) < 4.0
         ok = rays.ok & near

@@ -24,9 +24,8 @@ from uavkit.process.candidates import Candidates
 from uavkit.process.measurement import RayTasks, measure_rays
 from uavkit.process.options import CandidateOptions, MeasurementOptions
 from uavkit.process.orientation_code import orientation_codes, richness, select_points
-from uavkit.process.pictures import PictureStore
+from uavkit.process.pictures import PictureStore, PyramidStore
 from uavkit.process.pyramid import PyramidOptions, full_from_level, refine_through_pyramid
-from uavkit.process.tie_points import PyramidStore
 from uavkit.process.tracking import TimedPicture, square_field, track
 
 _DETECTION_LEVEL = 2
@@ -248,7 +247,7 @@ def _measured(
         start_px=xy[rows],
         warps=warps[rows],
     )
-    rays = measure_rays(given.store, tasks, given.measurement, workers=workers, progress=silent, stage="")
+    rays = measure_rays(given.pyramids, tasks, given.measurement, workers=workers, progress=silent, stage="")
     ok, sigma = np.zeros(len(xy), dtype=bool), np.full((len(xy), 2), np.nan)
     ok[rows] = rays.ok
     sigma[rows] = rays.sigma_px
