@@ -126,6 +126,7 @@ def test_video_without_shutter_places_stills_by_content_alone():
     places = check_places(outcome, made)
     assert len(places) == 3
     assert {place.kind for place in places.values()} == {"content"}
+    assert 0.0 < outcome.sync.residual_px < 3.0 * 2.4
     assert any("shows no shutter" in note for note in outcome.notes)
 
 

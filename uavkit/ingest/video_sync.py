@@ -201,7 +201,7 @@ def _by_events(
     alignment = _align(scene, events, evidence)
     pairs = [(int(i), int(j)) for i, j in alignment.pairs]
     certain = [(i, j) for i, j in pairs if evidence[i, j] > 0]
-    transformation, residual = _transformation(scene, views, certain, common)
+    transformation, residual = _transformation(scene, views, certain, (common, _own_residual_px(matches.values())))
     places = [
         _place(scene.infos[i].name, events[j], float(p)) for (i, j), p in zip(pairs, alignment.probability, strict=True)
     ]
@@ -356,10 +356,11 @@ def _evidence(
 
 
 def _transformation(
-    scene: _Scene, views: list[_EventView], pairs: list[tuple[int, int]], common: AffineTransformation
+    scene: _Scene, views: list[_EventView], pairs: list[tuple[int, int]], start: tuple[AffineTransformation, float]
 ) -> tuple[AffineTransformation, float]:
-    """Return the affine transformation over all pairs, refined twice by phase correlation, with its residual (RMS)."""
-    result, residual = common, float("nan")
+    """Return the affine transformation over all pairs, refined twice by phase correlation, with its residual (RMS);
+    what it started from where too few windows correlate."""
+    result, residual = start
     for _ in range(2):
         frame_xy, still_xy = [np.zeros((0, 2))], [np.zeros((0, 2))]
         for i, j in pairs:
@@ -372,6 +373,12 @@ def _transformation(
             break
         result, residual = robust_affine(source, target, np.ones(len(source)))
     return result, residual
+
+
+def _own_residual_px(matches: Iterable[ContentMatch]) -> float:
+    """Return the RMS of a coordinate's residual of matches in their own transformations, in still pixels."""
+    residuals = [match.still_xy - match.still_from_video.apply(match.frame_xy) for match in matches]
+    return float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
 
 
 def _ambiguous_notes(scene: _Scene, alignment: SequenceAlignment, events: tuple[ShutterEvent, ...]) -> list[str]:
@@ -477,7 +484,8 @@ def _by_content_alone(scene: _Scene, span: tuple[int, int], notes: list[str], pr
             places.append(place)
             previous = place.last_frame
     notes.append("places by content alone: the finder is assumed to show the middle of the still")
-    return _outcome(scene, places, (common, float("nan")), [], notes)
+    residual_px = _own_residual_px(match for _, _, match in best)
+    return _outcome(scene, places, (common, residual_px), [], notes)
 
 
 def _sampled_features(scene: _Scene, span: tuple[int, int], progress: Progress) -> dict[int, Features]:
