@@ -117,13 +117,14 @@ def process(project: Project, workers: int = 1, progress: Progress = silent) -> 
 
 def _write_result(project: Project, result: OrientedBlock) -> None:
     from uavkit.formats.orientation_files import write_exterior_orientations, write_interior_orientation
-    from uavkit.formats.point_files import write_las
+    from uavkit.formats.point_files import write_las, write_ply
 
     folder = project.stage_folder(Stage.PROCESS)
     write_oriented_block(project.result_file, result)
     write_adjustment(folder / "adjustment.json", result)
     write_exterior_orientations(folder / "exterior_orientation.csv", result)
     write_interior_orientation(folder / "interior_orientation.toml", result)
+    write_ply(folder / "points.ply", result)
     write_las(folder / "points.laz", result)
 
 
