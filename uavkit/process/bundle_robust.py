@@ -234,12 +234,24 @@ def _anchor(system: BundleSystem, state: State, scale: float) -> Anchor:
     )
 
 
+def _stepped(system: BundleSystem, state: State, weights: Weights, damping: float) -> tuple[State, float]:
+    """Return the state after up to four steps at fixed weights, and the damping."""
+    for _ in range(4):
+        step = gauss_newton_step(system, state, weights, damping)
+        state, damping = step.state, step.damping
+        if step.size < 0.1:
+            break
+    return state, damping
+
+
 def tukey_solution(
     system: BundleSystem, state: State, weights: Weights, options: AdjustmentOptions, progress: Progress = silent
 ) -> tuple[State, Weights]:
     """Return the solution with Tukey's weights, redundancy numbers and scales renewed in each round."""
-    damping = 0.0
     function = partial(tukey_weight, c=options.tukey_c)
+    # The start held the orientations to their approximations: only without that are residuals as small as their
+    # redundancy numbers say, which matters most to the few control points that fix the datum.
+    state, damping = _stepped(system, state, weights, 0.0)
     for number in range(TUKEY_ROUNDS):
         progress("bundle block adjustment: robust weights", number, TUKEY_ROUNDS)
         lost, last, weights = lost_points(system, weights), weights, revived(system, weights)
@@ -247,11 +259,7 @@ def tukey_solution(
         state = reintersected(system, state, normalised(system, state, weights, leverages).scale(0), lost)
         found = normalised(system, state, weights, leverages)
         weights = _weighted(system, found, found.scales, (function, function))
-        for _ in range(4):
-            step = gauss_newton_step(system, state, weights, damping)
-            state, damping = step.state, step.damping
-            if step.size < 0.1:
-                break
+        state, damping = _stepped(system, state, weights, damping)
         if number > 1 and float(np.max(np.abs(weights.rays - last.rays), initial=0.0)) < 0.05:
             break
     return state, weights
