@@ -274,7 +274,7 @@ def _tile_value(tiles: Bytes, m: int, lod: float, x: float, y: float) -> float:
 def _detail(tiles: Bytes, shares: Array, lod: float, x: float, y: float) -> float:
     """Fine detail of the ground, a relative brightness: two layers of each material's tile, turned by 37 degrees."""
     value = 0.0
-    fade = min(4.0 - lod, 1.0)  # the map of the site holds what is left beyond
+    fade = min((3.6 - lod) / 0.6, 1.0)  # the map of the site holds what is left beyond
     if fade <= 0.0:
         return value
     u, v = x / TILE_CELL_M, y / TILE_CELL_M
