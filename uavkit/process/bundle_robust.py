@@ -42,6 +42,8 @@ CAUCHY_C = 2.385
 START_C = 6.0
 SHRINK = 2.0
 """The scale of the start sinks at most by this factor a step, so that no image is locked out on the way."""
+SETTLED = 0.97
+"""Scales that no longer sink below this share of what they were have found their level."""
 ANCHOR = 0.5
 """Sigma of the approximate orientations at the start, as a share of what the first misclosures amount to."""
 FAR_OFF = 50.0
@@ -178,12 +180,12 @@ def robust_start(system: BundleSystem, state: State) -> tuple[State, Weights]:
     error.
     """
     weights, damping = system.full_weights(), 1e-4
-    anchored, scales = system, np.zeros(0)
+    anchored, scales, last_size = system, np.zeros(0), np.inf
     for number in range(START_STEPS):
         lost, weights = lost_points(system, weights), revived(system, weights)
         leverages = local_leverage(system, state, weights)
         found = normalised(system, state, weights, leverages, START_REDUNDANCY)
-        scales = image_scales(system, found, scales)
+        before, scales = scales, image_scales(system, found, scales)
         by_ray = ray_scales(system, scales)
         state = reintersected(system, state, by_ray, lost)
         if number == 0:
@@ -194,8 +196,11 @@ def robust_start(system: BundleSystem, state: State) -> tuple[State, Weights]:
         weights = _weighted(system, found, (by_ray, gnss, control), functions)
         step = gauss_newton_step(anchored, state, weights, damping)
         state, damping = step.state, step.damping
-        if float(np.max(scales)) <= 1.5 and step.size < 3.0:
+        settled = float(np.max(scales)) <= 1.5 or (before.size > 0 and bool(np.all(scales > SETTLED * before)))
+        # In a large block weights go on flipping between two states: steps that no longer shrink are the end, too.
+        if settled and (step.size < 3.0 or step.size > 0.8 * last_size):
             break
+        last_size = step.size
     return state, weights
 
 
