@@ -108,7 +108,9 @@ def simulate(
     scale: Annotated[float, typer.Option(help="Size of the stills against 4000 x 3000, 0.1 to 1.")] = 1.0,
     strips: Annotated[int, typer.Option(help="Strips, 1 to 5.")] = 3,
     stations: Annotated[int, typer.Option(help="Stills in each strip, 2 to 13.")] = 11,
-    video: Annotated[Literal["ntsc", "pal", "none"], typer.Option(help="Standard of the finder's video.")] = "ntsc",
+    video_standard: Annotated[
+        Literal["ntsc", "pal", "none"], typer.Option(help="Television standard of the finder's video, or no video.")
+    ] = "ntsc",
     seed: Annotated[int, typer.Option(help="Of everything that is random.")] = 1,
     workers: Workers = CORES,
 ) -> None:
@@ -124,7 +126,7 @@ def simulate(
                 "strips": strips,
                 "stations_per_strip": stations,
                 "gnss_outliers": min(3, strips * stations // 11),
-                "video_standard": video,
+                "video_standard": video_standard,
                 "seed": seed,
                 "workers": workers,
             },
