@@ -29,7 +29,9 @@ LEAST_ANGLE_RAD = np.radians(2.0)
 """Rays that meet at less do not fix a point's depth."""
 _IMAGE_FROM_VISION = np.diag([1.0, -1.0, -1.0])
 _ROUGH_SIGMA_PX = 1.0
-_MOST_POINTS_PER_STILL = 400
+_MOST_POINTS_PER_STILL = 300
+GROWTH = 1.5
+"""The block is adjusted each time it has grown by this factor."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,12 +101,14 @@ def orient_approximately(
         if image is not None and not _resect(block, rays, image):
             failed[image] = _known_points_in(block, rays)[image]
             continue
-        if image is None and not _attach(block, rays):
-            break
-        _intersect(block, rays)
+        if image is None:
+            image = _attach(block, rays)
+            if image is None:
+                break
+        _intersect(block, rays, image)
         if int(block.oriented.sum()) >= next_adjustment:
             rays = _adjust(block, rays, sigmas)
-            next_adjustment = int(np.ceil(1.25 * block.oriented.sum()))
+            next_adjustment = int(np.ceil(GROWTH * block.oriented.sum()))
         progress("approximate orientation", int(block.oriented.sum()), counts[0])
     rays = _adjust(block, rays, sigmas)
     _explain(block, rays)
@@ -225,7 +229,7 @@ def _resect(block: GrowingBlock, rays: RayTable, image: int) -> bool:
     return True
 
 
-def _attach(block: GrowingBlock, rays: RayTable) -> bool:
+def _attach(block: GrowingBlock, rays: RayTable) -> int | None:
     """Orient a still by relative orientation to an oriented one, its base scaled by a few points known already.
 
     The way of the aeropolygon: where stills overlap little more than half, hardly a point is seen in three, too few
@@ -237,14 +241,14 @@ def _attach(block: GrowingBlock, rays: RayTable) -> bool:
     for flat in np.argsort(-common, axis=None, kind="stable")[:40].tolist():
         here, image = divmod(flat, len(common))
         if common[here, image] < LEAST_PAIR_POINTS:
-            return False
+            return None
         rotation, base, score = _relative_orientation(rays, here, image, block.interior)
         scale = _base_scale(block, rays, (here, image), rotation, base) if score > 0 else 0.0
         if scale > 0:
             block.rotations[image] = block.rotations[here] @ rotation
             block.centres[image] = block.centres[here] + scale * block.rotations[here] @ base
-            return True
-    return False
+            return int(image)
+    return None
 
 
 def _base_scale(block: GrowingBlock, rays: RayTable, pair: tuple[int, int], rotation: Array, base: Array) -> float:
@@ -267,48 +271,59 @@ def _base_scale(block: GrowingBlock, rays: RayTable, pair: tuple[int, int], rota
 
 
 def intersect_linearly(point: Indices, origins: Array, directions: Array, count: int) -> tuple[Array, Array]:
-    """Return the points (count, 3) nearest to their rays, and the largest angle at which rays meet (approximate).
+    """Return the points (count, 3) nearest to their rays, and the angle at which the rays meet (approximate).
 
-    Normal equations of the distances to the rays; the smallest eigenvalue of the mean projector tells the angle.
+    Normal equations of the distances to the rays. n unit vectors spread by an angle a have a mean of length cos(a / 2)
+    (exact for two rays). Points of less than two rays, or of parallel ones, are NaN.
     """
-    projectors = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    normal = np.zeros((count, 3, 3))
-    right = np.zeros((count, 3))
-    np.add.at(normal, point, projectors)
-    np.add.at(right, point, np.einsum("kij,kj->ki", projectors, origins))
-    rays = np.maximum(np.bincount(point, minlength=count), 1)
-    # n rays spread by an angle a about their mean leave a smallest eigenvalue of about n (a / 2)^2.
-    least = np.maximum(np.linalg.eigvalsh(normal)[:, 0] / rays, 0.0)
-    angle = 2.0 * np.sqrt(least)
+
+    def total(values: Array) -> Array:
+        return np.bincount(point, values, count)
+
+    x, y, z = directions.T
+    projectors = [1.0 - x * x, -x * y, -x * z, 1.0 - y * y, -y * z, 1.0 - z * z]
+    normal = np.stack([total(values) for values in projectors], axis=1)[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
+    along = np.sum(origins * directions, axis=1)
+    right = np.stack([total(origins[:, axis] - along * directions[:, axis]) for axis in range(3)], axis=1)
+    rays = np.bincount(point, minlength=count)
+    length = np.linalg.norm(np.stack([total(x), total(y), total(z)], axis=1), axis=1) / np.maximum(rays, 1)
+    angle = np.where(rays >= 2, 2.0 * np.arccos(np.clip(length, 0.0, 1.0)), 0.0)
     points = np.full((count, 3), np.nan)
     good = angle > 1e-4
-    points[good] = np.linalg.solve(normal[good], right[good][:, :, None])[:, :, 0]
+    points[good] = np.linalg.solve(normal[good].reshape(-1, 3, 3), right[good][:, :, None])[:, :, 0]
     return points, angle
 
 
-def _intersect(block: GrowingBlock, rays: RayTable) -> None:
-    """Intersect all points that at least two oriented stills see, leaving out rays that do not fit."""
-    rows = np.flatnonzero(block.oriented[rays.image])
+def _intersect(block: GrowingBlock, rays: RayTable, image: int | None = None) -> None:
+    """Intersect the points of a still (or all) that two oriented stills see, leaving out rays that do not fit."""
+    wanted = np.full(len(block.points), image is None)
+    if image is not None:
+        wanted[rays.point[rays.image == image]] = True
+    rows = np.flatnonzero(block.oriented[rays.image] & wanted[rays.point])
+    numbers, point = np.unique(rays.point[rows], return_inverse=True)
     directions = np.einsum("kij,kj->ki", block.rotations[rays.image[rows]], rays.directions[rows])
     origins = block.centres[rays.image[rows]]
-    fits = np.ones(len(rows), dtype=bool)
+    fits, bad = np.ones(len(rows), dtype=bool), np.zeros(len(rows), dtype=bool)
+    points, angle = np.full((len(numbers), 3), np.nan), np.zeros(len(numbers))
     tolerance = RESECTION_TOLERANCE_PX / block.interior.principal_distance_px
     for _ in range(3):
-        points, angle = intersect_linearly(rays.point[rows][fits], origins[fits], directions[fits], len(block.points))
-        to_point = points[rays.point[rows]] - origins
+        points, angle = intersect_linearly(point[fits], origins[fits], directions[fits], len(numbers))
+        to_point = points[point] - origins
         depth = np.sum(to_point * directions, axis=1)
         with np.errstate(invalid="ignore"):
             miss = np.linalg.norm(to_point - depth[:, None] * directions, axis=1) / depth
             bad = ~(miss < tolerance) | ~(depth > 0)
-        worst = np.zeros(len(block.points))
-        np.maximum.at(worst, rays.point[rows], np.where(fits & bad, np.nan_to_num(miss, nan=1e9), 0.0))
-        drop = fits & bad & (np.nan_to_num(miss, nan=1e9) >= worst[rays.point[rows]])
+        miss = np.where(bad, np.nan_to_num(miss, nan=1e9), 0.0)
+        worst = np.zeros(len(numbers))
+        np.maximum.at(worst, point[fits], miss[fits])
+        drop = fits & bad & (miss >= worst[point])
         if not drop.any():
             break
         fits &= ~drop
-    enough = np.bincount(rays.point[rows][fits & ~bad], minlength=len(block.points)) >= 2
+    enough = np.bincount(point[fits & ~bad], minlength=len(numbers)) >= 2
     points[~(enough & (angle > LEAST_ANGLE_RAD))] = np.nan
-    block.points = points
+    block.points[wanted] = np.nan
+    block.points[numbers] = points
 
 
 def _adjust(block: GrowingBlock, rays: RayTable, sigmas: InteriorSigmas) -> RayTable:

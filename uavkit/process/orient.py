@@ -41,8 +41,6 @@ from uavkit.process.summary import Findings, peak_memory_mb, summarise
 from uavkit.process.tie_points import TiePointMatching
 from uavkit.process.video_points import VideoInput, candidates_through_video
 
-_MOST_EXTRA_ROUNDS = 1
-
 
 @dataclass(kw_only=True)
 class Workplace:
@@ -131,20 +129,18 @@ def _approximate_block(place: Workplace) -> tuple[Candidates, GrowingBlock]:
     candidates, weak = _first_candidates(place)
     growing = _approximately(place, candidates, last=not weak)
     source = place.options.candidates.source
-    for _ in range(_MOST_EXTRA_ROUNDS):
-        loose = set() if growing is None else set(np.flatnonzero(~growing.oriented).tolist())
-        if source is not CandidateSource.AUTO or (growing is not None and not loose) or not weak:
-            break
-        pairs = weak if growing is None else [pair for pair in weak if loose & set(pair)]
-        if not pairs:
-            break
-        place.notes.append(
-            f"the video did not tie {len(loose) or len(place.store)} stills: features were tried in {len(pairs)} pairs"
-        )
+    for ends in (1, 2):  # first pairs between what is oriented and what is not, then pairs of which nothing is
+        loose = set(range(len(place.store)) if growing is None else np.flatnonzero(~growing.oriented).tolist())
+        pairs = [pair for pair in weak if len(loose & set(pair)) == ends]
+        if source is not CandidateSource.AUTO or not pairs:
+            continue
+        place.notes.append(f"the video did not tie {len(loose)} stills: features were tried in {len(pairs)} pairs")
         candidates = join([candidates, _feature_candidates(place, pairs)])
+        growing = _approximately(place, candidates, last=ends == 2)
+    if growing is None:
         growing = _approximately(place, candidates, last=True)
-    if growing is None:  # not reached: the last attempt raises
-        raise AdjustmentError("no approximate orientation")
+    if growing is None:  # not reached: a last attempt without success raises
+        raise AdjustmentError("the stills could not be oriented approximately")
     return candidates, growing
 
 
