@@ -9,6 +9,7 @@ from uavkit.core.adjustment import Datum
 from uavkit.core.angles import omega_phi_kappa_jacobian
 from uavkit.core.arrays import Array, Flags, Indices
 from uavkit.core.camera import INTERIOR_PARAMETERS, InteriorOrientation
+from uavkit.core.points import CheckPoint, ControlPoint
 from uavkit.core.result import OrientedBlock, PointDifference
 
 
@@ -282,29 +283,29 @@ def strip_ties(result: OrientedBlock) -> tuple[Indices, Indices]:
     return numbers, np.rint(seen.T @ seen).astype(np.int64)
 
 
-def gnss_stations(result: OrientedBlock) -> tuple[str, ...]:
-    """Return the still of each GNSS observation of the adjustment; numbers where they cannot be told apart.
-
-    The adjustment may hold the fixes of the oriented stills only.
-    """
-    gnss, count = result.block.gnss, len(result.adjustment.gnss_used)
-    if gnss is None:
-        return tuple(f"fix {number + 1}" for number in range(count))
-    names = [result.block.stills[index].name for index in gnss.image_index]
-    oriented = [name for name in names if name in set(result.images)]
-    for candidate in (names, oriented):
-        if len(candidate) == count:
-            return tuple(candidate)
-    return tuple(f"fix {number + 1}" for number in range(count))
-
-
 def gnss_rows(result: OrientedBlock) -> Indices:
-    """Return the row of ``block.gnss`` of each GNSS observation of the adjustment, -1 where it cannot be told."""
+    """Return the row of ``block.gnss`` of each GNSS observation of the adjustment; -1 where the numbers do not agree.
+
+    The adjustment holds the observations of the oriented stills, in their order.
+    """
     gnss, count = result.block.gnss, len(result.adjustment.gnss_used)
     if gnss is not None:
         oriented = set(result.images)
         kept = [row for row, i in enumerate(gnss.image_index) if result.block.stills[i].name in oriented]
-        for rows in (np.arange(len(gnss)), np.array(kept, dtype=np.int64)):
-            if len(rows) == count:
-                return np.asarray(rows, dtype=np.int64)
+        if len(kept) == count:
+            return np.array(kept, dtype=np.int64)
     return np.full(count, -1, dtype=np.int64)
+
+
+def gnss_stations(result: OrientedBlock) -> tuple[str, ...]:
+    """Return the still of each GNSS observation of the adjustment; numbers where they cannot be told apart."""
+    gnss, rows = result.block.gnss, gnss_rows(result)
+    if gnss is None or np.any(rows < 0):
+        return tuple(f"fix {number + 1}" for number in range(len(rows)))
+    return tuple(result.block.stills[gnss.image_index[row]].name for row in rows)
+
+
+def without_result(surveyed: Sequence[ControlPoint | CheckPoint], found: Sequence[PointDifference]) -> tuple[str, ...]:
+    """Return the names of surveyed points that the block has no coordinates of."""
+    names = {point.name for point in found}
+    return tuple(point.name for point in surveyed if point.name not in names)
