@@ -18,7 +18,7 @@ from tests.process.made_blocks import (
 )
 from uavkit.core.adjustment import Datum
 from uavkit.core.block import Block
-from uavkit.core.camera import InteriorSigmas
+from uavkit.core.camera import InteriorOrientation, InteriorSigmas
 from uavkit.core.points import ControlPoint, ImageMark
 from uavkit.process.approximations import GrowingBlock
 from uavkit.process.candidates import Candidates
@@ -30,6 +30,7 @@ from uavkit.process.network import (
     marked_points,
     network_of,
     updated,
+    without_weak_stills,
 )
 from uavkit.process.options import AdjustmentSection
 
@@ -230,3 +231,33 @@ def test_update_takes_over_what_was_adjusted_and_forgets_other_points() -> None:
     others = np.setdiff1d(np.arange(len(after.points)), adjusted.points)
     assert np.isnan(after.points[others]).all()
     assert after.interior == adjusted.result.interior
+
+
+def test_a_still_of_too_few_shared_points_is_left_out_and_named() -> None:
+    """Still 2 shares seven points with the others, one less than an adjustment needs: it goes, the others stay."""
+    points, stills = 20, 3
+    ray_point = np.concatenate([np.arange(points), np.arange(7)])
+    ray_image = np.concatenate([np.full(points, 1), np.full(7, 2)])
+    candidates = Candidates(
+        reference_image=np.zeros(points, dtype=np.int64),
+        reference_px=np.zeros((points, 2)),
+        origin=np.ones(points, dtype=np.int8),
+        ray_point=ray_point,
+        ray_image=ray_image,
+        ray_px=np.zeros((len(ray_point), 2)),
+        ray_sigma_px=np.full((len(ray_point), 2), 0.1),
+    )
+    growing = GrowingBlock(
+        interior=InteriorOrientation(width_px=100, height_px=100, principal_distance_px=100.0, x0_px=49.5, y0_px=49.5),
+        centres=np.zeros((stills, 3)),
+        rotations=np.tile(np.eye(3), (stills, 1, 1)),
+        points=np.zeros((points, 3)),
+        reasons={},
+    )
+    none = np.zeros(0, dtype=np.int64)
+    marked = MarkedPoints(
+        points=(), control=0, point=none, image=none, xy_px=np.zeros((0, 2)), sigma_px=np.zeros((0, 2))
+    )
+    left = without_weak_stills(growing, candidates, marked)
+    assert left.oriented.tolist() == [True, True, False]
+    assert left.reasons == {2: "only 7 of its points were found in other stills too (8 needed)"}

@@ -27,7 +27,7 @@ from uavkit.core.points import PointKind
 from uavkit.core.result import OrientedBlock
 from uavkit.process.absolute import fit_similarity
 from uavkit.process.options import CandidateOptions, CandidateSource, MeasurementOptions, ProcessOptions
-from uavkit.process.orient import options_key, orient_block
+from uavkit.process.orient import orient_block
 
 OPTIONS = ProcessOptions(
     candidates=CandidateOptions(feature_width_px=800, features=700), measurement=MeasurementOptions(window_px=21)
@@ -193,13 +193,3 @@ def test_what_cannot_be_done_is_refused_at_once(made: Made) -> None:
     video_only = replace(OPTIONS, candidates=replace(OPTIONS.candidates, source=CandidateSource.VIDEO))
     with pytest.raises(InputError, match="no video"):
         orient_block(part.block, part.stills, None, video_only)
-
-
-def test_the_key_of_options_changes_with_any_of_them() -> None:
-    keys = {
-        options_key(ProcessOptions()),
-        options_key(OPTIONS),
-        options_key(replace(OPTIONS, measurement=MeasurementOptions(window_px=23))),
-    }
-    assert len(keys) == 3
-    assert options_key(ProcessOptions()) == options_key(ProcessOptions())

@@ -4,7 +4,7 @@ Relative orientation of a strong pair, then resection of one still after the oth
 an adjustment of what there is so far (incremental block formation, Mikhail, Bethel, McGlone 2001, sec. 5.8).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -12,10 +12,8 @@ import numpy as np
 from uavkit.core.adjustment import AdjustmentInput, AdjustmentOptions, AdjustmentResult, Datum
 from uavkit.core.arrays import Array, Flags, Indices
 from uavkit.core.camera import InteriorOrientation, InteriorSigmas, ideal_from_pixels
-from uavkit.core.collinearity import image_coordinates
 from uavkit.core.errors import AdjustmentError
 from uavkit.core.observations import Rays
-from uavkit.core.orientation import ExteriorOrientation
 from uavkit.core.progress import Progress
 from uavkit.process.bundle import adjust_block
 
@@ -377,20 +375,3 @@ def _explain(block: GrowingBlock, rays: RayTable) -> None:
             )
         else:
             block.reasons[image] = f"its {seen[image]} points do not agree on one orientation"
-
-
-def reprojection(block: GrowingBlock, rays: RayTable) -> Array:
-    """Return observed minus projected image points (k, 2) in pixels, NaN where still or point is not known."""
-    residuals = np.full((len(rays.point), 2), np.nan)
-    for image in np.flatnonzero(block.oriented).tolist():
-        rows = np.flatnonzero(rays.image == image)
-        exterior = ExteriorOrientation(
-            projection_centre_m=block.centres[image], R_object_from_image=block.rotations[image]
-        )
-        residuals[rows] = rays.xy_px[rows] - image_coordinates(block.points[rays.point[rows]], exterior, block.interior)
-    return residuals
-
-
-def with_sigmas(sigmas: InteriorSigmas, **values: float) -> InteriorSigmas:
-    """Return sigmas with some of them replaced."""
-    return replace(sigmas, **values)

@@ -1,6 +1,6 @@
 """From candidates and approximations to adjustments: the rows that the bundle block adjustment takes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from uavkit.process.approximations import GrowingBlock, RayTable, intersect_line
 from uavkit.process.bundle import adjust_block
 from uavkit.process.candidates import Candidates
 from uavkit.process.options import AdjustmentSection
+
+LEAST_RAYS = 8
+"""Rays to points that other stills see too, for a still to take part in the adjustment."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,6 +93,28 @@ def network_of(growing: GrowingBlock, candidates: Candidates, marked: MarkedPoin
         sigma_px=sigma,
         marks_from=m,
     )
+
+
+def without_weak_stills(growing: GrowingBlock, candidates: Candidates, marked: MarkedPoints) -> GrowingBlock:
+    """Return the block without stills that share too few points with the other oriented ones to be adjusted.
+
+    One such still would leave the whole adjustment undetermined; it is named with its reason instead.
+    """
+    point, image, _, _ = candidates.all_rays()
+    point = np.concatenate([point, len(candidates) + marked.point])
+    image = np.concatenate([image, marked.image])
+    centres, reasons = growing.centres.copy(), dict(growing.reasons)
+    while True:
+        oriented = np.isfinite(centres[:, 0])
+        rows = oriented[image]
+        shared = np.bincount(point[rows], minlength=len(candidates) + len(marked.points)) >= 2
+        count = np.bincount(image[rows & shared[point]], minlength=len(centres))
+        weak = np.flatnonzero(oriented & (count < LEAST_RAYS))
+        if len(weak) == 0:
+            return replace(growing, centres=centres, reasons=reasons)
+        worst = int(weak[np.argmin(count[weak])])
+        centres[worst] = np.nan
+        reasons[worst] = f"only {count[worst]} of its points were found in other stills too ({LEAST_RAYS} needed)"
 
 
 def _robust_points(rays: RayTable, growing: GrowingBlock, count: int) -> Array:

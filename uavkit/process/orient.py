@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from uavkit.core.adjustment import Datum
-from uavkit.core.arrays import Array, content_hash
+from uavkit.core.arrays import Array
 from uavkit.core.block import Block
 from uavkit.core.cache import NoCache, StepCache
 from uavkit.core.devices import StillSource, VideoSource
@@ -21,6 +21,7 @@ from uavkit.core.progress import Progress, silent
 from uavkit.core.result import OrientedBlock, PointOrigin
 from uavkit.process.absolute import robust_similarity
 from uavkit.process.approximations import GrowingBlock, orient_approximately, ray_table
+from uavkit.process.calibration import calibrated
 from uavkit.process.candidates import Candidates, empty, from_measurements, join
 from uavkit.process.features import feature_tasks, match_features, pairs_to_compare
 from uavkit.process.measurement import measure_rays
@@ -33,11 +34,13 @@ from uavkit.process.network import (
     marked_points,
     network_of,
     updated,
+    without_weak_stills,
 )
 from uavkit.process.options import CandidateSource, ProcessOptions
 from uavkit.process.pictures import PictureStore, PyramidStore
-from uavkit.process.ray_sigma import SigmaCalibration, calibrate_sigmas
+from uavkit.process.ray_sigma import SigmaCalibration
 from uavkit.process.summary import Findings, peak_memory_mb, summarise
+from uavkit.process.thinning import points_apart
 from uavkit.process.tie_points import TiePointMatching
 from uavkit.process.video_points import VideoInput, candidates_through_video
 
@@ -101,7 +104,7 @@ def orient_block(
     )
     candidates, growing = _approximate_block(place)
     marked = marked_points(block)
-    tied, network = _tie(place, candidates, growing, marked)
+    tied, network, reasons = _tie(place, candidates, growing, marked)
     with place.step("absolute orientation"):
         network, oriented_absolutely = _to_object_space(place, network, marked)
     with place.step("adjustment"):
@@ -113,7 +116,7 @@ def orient_block(
     with place.step("summary"):
         found = Findings(
             block=block,
-            reasons=growing.reasons,
+            reasons=reasons,
             candidates=candidates,
             tied=tied,
             network=network,
@@ -249,8 +252,11 @@ def _approximately(place: Workplace, candidates: Candidates, *, last: bool) -> G
 
 def _tie(
     place: Workplace, candidates: Candidates, growing: GrowingBlock, marked: MarkedPoints
-) -> tuple[Candidates, Network]:
-    """Find every point in every still that should see it, twice: the second time with the better orientation."""
+) -> tuple[Candidates, Network, dict[int, str]]:
+    """Find every point in every still that should see it, twice: the second time with the better orientation.
+
+    Also returns why stills are not oriented.
+    """
     matching = TiePointMatching(
         pyramids=place.pyramids,
         options=place.options.measurement,
@@ -260,17 +266,21 @@ def _tie(
     tied = candidates
     for turn in (1, 2):
         with place.step("free network"):
+            growing = without_weak_stills(growing, tied, marked)
             network = network_of(growing, tied, marked)
             adjusted = _free_network(place, network, marked)
             growing = _regrown(growing, updated(network, adjusted))
         with place.step("tie points"):
             tied = matching.match(candidates, growing, adjusted, known=None if turn == 1 else tied)
+            apart = points_apart(tied, _LEAST_DISTANCE * place.options.measurement.window_px)
+            candidates, tied = candidates.only_points(apart), tied.only_points(apart)
     with place.step("free network"):
+        growing = without_weak_stills(growing, tied, marked)
         network = network_of(growing, tied, marked)
         adjusted = _free_network(place, network, marked)
-        network, calibration = _calibrated(updated(network, adjusted), adjusted)
+        network, calibration = calibrated(updated(network, adjusted), adjusted)
         _note_calibration(place, calibration)
-    return tied, network
+    return tied, network, growing.reasons
 
 
 def _free_network(place: Workplace, network: Network, marked: MarkedPoints) -> AdjustedNetwork:
@@ -288,36 +298,6 @@ def _regrown(growing: GrowingBlock, network: Network) -> GrowingBlock:
         points=network.points[: network.marks_from],
         reasons=growing.reasons,
     )
-
-
-def _calibrated(network: Network, adjusted: AdjustedNetwork) -> tuple[Network, SigmaCalibration]:
-    """Return the network with the sigmas of its measured rays calibrated by variance components."""
-    result, rows = adjusted.result, adjusted.ray_rows
-    measured = network.point[rows] < network.marks_from
-    calibration = calibrate_sigmas(
-        result.ray_residuals_px[measured],
-        adjusted.rays.sigma_px[measured],
-        result.ray_redundancy[measured],
-        _angles_to_mean(network)[rows][measured],
-        result.ray_used[measured],
-    )
-    sigma = network.sigma_px.copy()
-    pooled = float(np.median(calibration.factor)) if len(calibration.factor) else 1.0
-    sigma[network.point < network.marks_from] *= pooled
-    sigma[rows[measured]] = adjusted.rays.sigma_px[measured] * calibration.factor[:, None]
-    return replace(network, sigma_px=sigma), calibration
-
-
-def _angles_to_mean(network: Network) -> Array:
-    """Return the angle (k,) of each ray to the mean direction of its point's rays, radians; 0 where not known."""
-    to_camera = network.centres[network.image] - network.points[network.point]
-    to_camera /= np.linalg.norm(to_camera, axis=1)[:, None]
-    known = np.isfinite(to_camera[:, 0])
-    mean = np.zeros((len(network.points), 3))
-    np.add.at(mean, network.point[known], to_camera[known])
-    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-12)[:, None]
-    cosine = np.sum(np.nan_to_num(to_camera) * mean[network.point], axis=1)
-    return np.asarray(np.where(known, np.arccos(np.clip(cosine, -1.0, 1.0)), 0.0))
 
 
 def _note_calibration(place: Workplace, calibration: SigmaCalibration) -> None:
@@ -373,8 +353,3 @@ def _with_single_ray_control(network: Network, marked: MarkedPoints) -> Network:
         if not np.isfinite(points[network.marks_from + number, 0]):
             points[network.marks_from + number] = point.position_m
     return replace(network, points=points)
-
-
-def options_key(options: ProcessOptions) -> str:
-    """Return a hash of the options: results of other options are out of date."""
-    return content_hash([repr(options)])
