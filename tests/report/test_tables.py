@@ -7,7 +7,20 @@ import pytest
 
 from uavkit.core.result import OrientedBlock
 from uavkit.report.drawing import round_number, shortened
-from uavkit.report.tables import Table, control_table, gnss_shift_table, interior_table, number, unoriented_table
+from uavkit.report.measures import METRIC
+from uavkit.report.tables import (
+    PaperComparison,
+    Table,
+    check_table,
+    comparison_table,
+    control_table,
+    gnss_shift_table,
+    interior_table,
+    length,
+    number,
+    precision_table,
+    unoriented_table,
+)
 
 
 @pytest.mark.parametrize(
@@ -78,3 +91,38 @@ def test_long_lists_are_folded(result: OrientedBlock) -> None:
     lost = {f"S{row}": "too dark" for row in range(60)}
     assert unoriented_table(replace(result, unoriented=lost)).folded
     assert not unoriented_table(result).folded
+
+
+def test_lengths_take_a_sensible_unit() -> None:
+    texts = [length(value, METRIC) for value in (0.0061, 0.2701, 3.6088, 100.01, float("nan"))]
+    assert texts == ["6.1 mm", "270 mm", "3.61 m", "100.01 m", "–"]
+
+
+def test_precision_of_many_metres_is_in_metres(result: OrientedBlock) -> None:
+    covariances = np.tile(np.diag([9.0, 16.0, 1e4]), (300, 1, 1))
+    poor = replace(result, adjustment=replace(result.adjustment, point_covariances_m2=covariances))
+    rows = {row[0]: row[3] for row in precision_table(poor).rows}
+    assert rows["Object points XY [m]"] == "5.000"
+    assert rows["Object points Z [m]"] == "100.000"
+    assert rows["Projection centres Z [mm]"] == "8.0"
+
+
+def test_small_sigmas_keep_their_digits(result: OrientedBlock) -> None:
+    covariance = result.adjustment.interior_covariance.copy()
+    covariance[6, 6] = 3.2e-8**2
+    fine = replace(result, adjustment=replace(result.adjustment, interior_covariance=covariance))
+    rows = {row[0]: row for row in interior_table(fine).rows}
+    assert rows["p1"][4] == "0.000000032"
+
+
+def test_a_lost_check_point_is_listed(result: OrientedBlock) -> None:
+    table = check_table(replace(result, check=result.check[:-1]))
+    assert table.rows[-1] == ("C11", *("–",) * 9, "0")
+    assert "in no RMSE: C11." in table.note
+
+
+def test_a_reduced_survey_says_so(result: OrientedBlock) -> None:
+    full = comparison_table(result, PaperComparison(flight="constant"))
+    assert "Reduced" not in full.note
+    small = comparison_table(result, PaperComparison(flight="trace", scale=0.25, stills=9))
+    assert small.note.startswith("Reduced: 9 of 33 stills, pictures at 0.25 of their size, ")

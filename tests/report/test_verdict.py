@@ -123,3 +123,14 @@ def test_many_rejected_positions_limit_the_result(result: OrientedBlock) -> None
     assert "Rejected GNSS positions: 1 of 8" in said(result, Weight.WATCH)
     many = adjusted(result, gnss_used=np.arange(8) < 4)
     assert "Rejected GNSS positions: 4 of 8" in said(many, Weight.LIMIT)
+
+
+def test_a_profile_that_does_not_fit_is_named(result: OrientedBlock) -> None:
+    assert "far from the camera profile" not in said(result)
+    interior = replace(result.adjustment.interior, principal_distance_px=2684.0 + 10.5 * 30.0)
+    assert "principal_distance_px by +10.5" in said(adjusted(result, interior=interior), Weight.WATCH)
+
+
+def test_lost_check_points_are_named(result: OrientedBlock) -> None:
+    assert "no coordinates in the block" not in said(result)
+    assert "1 of 11 check points (C11)" in said(replace(result, check=result.check[:-1]), Weight.WATCH)

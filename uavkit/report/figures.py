@@ -71,7 +71,7 @@ def plan_view(result: OrientedBlock, ground: Ground) -> Drawing:
         vmax=high,
         lw=0,
     )
-    figure.colorbar(dots, ax=axes, label=f"Height [{unit}]", shrink=0.8, pad=0.02, aspect=30)
+    figure.colorbar(dots, ax=axes, label=f"Up [{unit}]", shrink=0.8, pad=0.02, aspect=30)
     for line in _strip_lines(result):
         axes.plot(line[:, 0], line[:, 1], color=INK, lw=0.9, zorder=3)
     stations = result.adjustment.projection_centres_m
@@ -88,7 +88,7 @@ def plan_view(result: OrientedBlock, ground: Ground) -> Drawing:
     drawn = len(result.images) <= MOST_FOOTPRINTS and not _looks_sideways(result)
     outlines = ", outlines of the stills on the ground" if drawn else ""
     strips = ", strips (lines)" if np.any(result.strips >= 0) else ""
-    caption = f"Stations (squares){strips}{outlines}, and object points coloured by height."
+    caption = f"Stations (squares){strips}{outlines}, and object points coloured by height in the local frame."
     return Drawing(name="plan", title="Stations and points from above", caption=caption, figure=figure)
 
 

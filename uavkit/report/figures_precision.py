@@ -41,7 +41,7 @@ from uavkit.report.measures import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-LEAST_ARROW_PX = 0.05
+LEAST_ARROW_PX = 0.0005
 """Residuals below this are not enlarged to fill the figure."""
 LEAST_RAYS = 3
 """In a cell of the image, for its mean residual to be drawn."""
@@ -76,10 +76,17 @@ def residual_vectors(result: OrientedBlock) -> Drawing:
     caption = (
         f"Mean residuals (observed minus adjusted) of all stills in cells of the image, enlarged "
         f"{1 / scale:.0f} times; red where a mean exceeds 3.5 of its own sigma: a sign of distortion "
-        f"that the interior orientation does not take up. Cross: principal point. RMS of single residuals: "
-        f"{rms[0]:.2f} px in columns, {rms[1]:.2f} px in rows."
+        f"that the interior orientation does not take up, or of rays whose errors are alike. Cross: principal point. "
+        f"RMS of single residuals: {_digits(rms[0])} px in columns, {_digits(rms[1])} px in rows."
     )
     return Drawing(name=name, title=title, caption=caption, figure=figure)
+
+
+def _digits(value: float) -> str:
+    """Return a number with two significant digits, without an exponent."""
+    if not (np.isfinite(value) and value > 0):
+        return "0"
+    return f"{value:.{max(1 - int(np.floor(np.log10(value))), 0)}f}"
 
 
 def _pooled(result: OrientedBlock, cells: int) -> tuple[Array, Array, Array]:
@@ -276,11 +283,14 @@ def _gnss_panel(axes: "Axes", residual: Array, sigma: Array, used: Flags, colour
     axes.vlines(place[used], 0.0, residual[used], color=colour, lw=0.8)
     axes.scatter(place[used], residual[used], color=colour, s=14, lw=0)
     axes.set_ylim(-limit, limit)
-    for row in np.flatnonzero(~used & np.isfinite(residual)):
+    rejected = np.flatnonzero(~used & np.isfinite(residual))
+    crowd = 0.1 * len(residual)
+    for row in rejected:
         value = residual[row]
         axes.plot(row, np.clip(value, -0.93 * limit, 0.93 * limit), "x", color=RED, ms=6, mew=1.5, zorder=4)
         if abs(value) > limit and int(np.sum(~used)) <= 15:
-            side = -1.0 if row > 0.85 * len(residual) else 1.0
+            follows = np.any((rejected > row) & (rejected < row + crowd))
+            side = -1.0 if row > 0.85 * len(residual) or (follows and row > crowd / 2) else 1.0
             axes.annotate(
                 f"{value:+.1f}", (row, np.sign(value) * 0.93 * limit), (side * 6, 0), textcoords="offset points",
                 fontsize=7.5, color=RED, va="center", ha="left" if side > 0 else "right",
@@ -332,7 +342,7 @@ def distortion_curve(result: OrientedBlock) -> Drawing:
     axes.set_xlim(0.0, radius[-1])
     plain_axes(axes, "Distance from the principal point, without distortion [px]", "Shift outwards [px]")
     axes.legend(loc="best", ncols=3)
-    caption = f"Radial distortion by k1, k2, k3; the sigma at the corner of the image is {sigma[-1]:.2f} px."
+    caption = f"Radial distortion by k1, k2, k3; the sigma at the corner of the image is {_digits(sigma[-1])} px."
     return Drawing(name=name, title=title, caption=caption, figure=figure)
 
 

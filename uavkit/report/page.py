@@ -7,6 +7,7 @@ from html import escape
 from pathlib import Path
 
 from uavkit.core.adjustment import Datum
+from uavkit.core.camera import CameraProfile
 from uavkit.core.errors import AdjustmentError
 from uavkit.core.progress import Progress, silent
 from uavkit.core.result import OrientedBlock
@@ -14,7 +15,8 @@ from uavkit.formats.atomic import atomic_path, write_text
 from uavkit.report import tables
 from uavkit.report.coverage import ground_surface
 from uavkit.report.measures import accuracy, length_unit
-from uavkit.report.tables import PaperComparison, Table, number, thousandths
+from uavkit.report.relative import relative_precision
+from uavkit.report.tables import PaperComparison, Table, number
 from uavkit.report.verdict import Remark, Weight, remarks, sigma0_sentence
 
 PAGE_NAME = "report.html"
@@ -152,13 +154,13 @@ def _headline(result: OrientedBlock, title: str, date: str) -> str:
     adjusted, unit = result.adjustment, length_unit(result)
     total = len(result.images) + len(result.unoriented)
     camera = result.block.camera
-    about = [f"Camera {camera.maker} {camera.name}".replace("  ", " "), _frame_text(result)]
+    about = [f"Camera {_camera_name(camera)}", _frame_text(result)]
     lines = [f"<h1>{escape(title)}</h1>", f"<p class='soft'>Report of the bundle block adjustment{_dated(date)}</p>"]
     keys = [
         ("Stills oriented", f"{len(result.images)} of {total}", _percent(len(result.images), total)),
-        ("Datum", DATUM_TEXTS[adjusted.datum].capitalize(), _datum_text(result)),
+        ("Datum", _sentence_case(DATUM_TEXTS[adjusted.datum]), _datum_text(result)),
         ("sigma0", number(adjusted.sigma0, 2), f"redundancy {adjusted.redundancy:.0f}"),
-        ("Ground sampling distance", f"{thousandths(result.gsd_m)} {unit.thousandth}", "mean of the block"),
+        ("Ground sampling distance", tables.length(result.gsd_m, unit), "mean of the block"),
         *_accuracy_keys(result),
     ]
     lines.append('<div class="keys">')
@@ -170,6 +172,17 @@ def _headline(result: OrientedBlock, title: str, date: str) -> str:
     lines.append(f"<p>{escape(sigma0_sentence(adjusted.sigma0, adjusted.redundancy).text)}</p>")
     lines.append(f"<p class='soft'>{escape('. '.join(about))}</p>")
     return "\n".join(lines)
+
+
+def _camera_name(camera: CameraProfile) -> str:
+    """Return maker and name; many names begin with the maker."""
+    if camera.name.casefold().startswith(camera.maker.casefold()):
+        return camera.name
+    return f"{camera.maker} {camera.name}"
+
+
+def _sentence_case(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _dated(date: str) -> str:
@@ -186,16 +199,31 @@ def _datum_text(result: OrientedBlock) -> str:
 
 
 def _accuracy_keys(result: OrientedBlock) -> list[tuple[str, str, str]]:
-    measured, unit = accuracy(result.check), length_unit(result).thousandth
+    measured, unit = accuracy(result.check), length_unit(result)
     if not measured.points:
-        xy, z = tables.point_sigma_medians_m(result)
-        predicted = f"XY {thousandths(xy)}, Z {thousandths(z)} {unit}"
-        text = "no check points: accuracy is predicted, not checked"
-        return [("Predicted sigma of points, median", predicted, text)]
+        return _predicted_keys(result)
     note = f"at {measured.points} check point{'s' if measured.points > 1 else ''}"
     return [
-        ("RMSE XY (both axes)", f"{thousandths(measured.rmse_xy_m)} {unit}", _in_gsd(measured.rmse_xy_gsd, note)),
-        ("RMSE Z", f"{thousandths(measured.rmse_z_m)} {unit}", _in_gsd(measured.rmse_z_gsd, note)),
+        ("RMSE XY (both axes)", tables.length(measured.rmse_xy_m, unit), _in_gsd(measured.rmse_xy_gsd, note)),
+        ("RMSE Z", tables.length(measured.rmse_z_m, unit), _in_gsd(measured.rmse_z_gsd, note)),
+    ]
+
+
+def _predicted_keys(result: OrientedBlock) -> list[tuple[str, str, str]]:
+    unit = length_unit(result)
+    xy, z = (tables.length(value, unit) for value in tables.point_sigma_medians_m(result))
+    text = "no check points: predicted, not checked"
+    inner = relative_precision(result)
+    if inner is None:
+        return [("Predicted sigma of points, median", f"XY {xy}, Z {z}", text)]
+    xy_in, z_in = (tables.median_length(values, unit) for values in (inner.point_xy_m, inner.point_z_m))
+    return [
+        ("Predicted absolute sigma of points", f"XY {xy}, Z {z}", f"median, with the shift of the GNSS; {text}"),
+        (
+            "Predicted sigma within the block",
+            f"XY {xy_in}, Z {z_in}",
+            "median of the points, without shift, rotation and scale by the GNSS",
+        ),
     ]
 
 

@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 
+from uavkit.core.adjustment import Datum
 from uavkit.core.angles import omega_phi_kappa_from_rotation
 from uavkit.core.arrays import Array
 from uavkit.core.camera import INTERIOR_PARAMETERS
@@ -13,6 +14,7 @@ from uavkit.core.points import PointKind
 from uavkit.core.result import OrientedBlock, PointDifference, PointOrigin
 from uavkit.report.measures import (
     Accuracy,
+    LengthUnit,
     accuracy,
     determined_points,
     exterior_sigmas,
@@ -24,9 +26,13 @@ from uavkit.report.measures import (
     rays_of_images,
     rays_of_points,
     strip_ties,
+    without_result,
 )
+from uavkit.report.relative import relative_precision
 
 NOTHING = "–"
+PUBLISHED_STILLS = 33
+WITHIN_THE_BLOCK = "after the block is fitted to the GNSS positions by shift, rotation and scale"
 COLLAPSE_ABOVE = 40
 """Tables with more rows than this are folded."""
 
@@ -52,6 +58,25 @@ class PaperComparison:
     """The flight of Anai et al. (2012) that a simulated survey repeats."""
 
     flight: Literal["constant", "trace"]
+    scale: float = 1.0
+    """Size of the simulated pictures beside the published ones, 0 to 1: 0.5 has half as many columns and rows."""
+    stills: int = PUBLISHED_STILLS
+    """Simulated; the published flight has 33."""
+
+    @property
+    def reduced(self) -> str:
+        """Return in one sentence how much smaller this survey is; empty at full size."""
+        parts = []
+        if self.stills != PUBLISHED_STILLS:
+            parts.append(f"{self.stills} of {PUBLISHED_STILLS} stills")
+        if self.scale != 1.0:
+            parts.append(
+                f"pictures at {self.scale:g} of their size, so that one pixel covers {1 / self.scale:.3g} times"
+            )
+        if not parts:
+            return ""
+        tail = " as much ground in length" if self.scale != 1.0 else ""
+        return f"Reduced: {', '.join(parts)}{tail}; its errors are not to be read as those of the whole flight."
 
     @property
     def described(self) -> str:
@@ -77,22 +102,50 @@ def thousandths(value_m: float) -> str:
     return number(1e3 * value_m, 1)
 
 
+def length(value_m: float, unit: LengthUnit) -> str:
+    """Return a length with its unit: in thousandths below one whole, with two decimals above it."""
+    if not np.isfinite(value_m):
+        return NOTHING
+    if abs(value_m) >= 1.0:
+        return f"{number(value_m, 2)} {unit.whole}"
+    return f"{number(1e3 * value_m, 0 if abs(value_m) >= 0.1 else 1)} {unit.thousandth}"
+
+
+def significant(value: float, digits: int = 2) -> str:
+    """Return a positive number with so many significant digits, without an exponent."""
+    if not np.isfinite(value) or value <= 0:
+        return number(value, 0)
+    return number(value, max(digits - 1 - int(np.floor(np.log10(value))), 0))
+
+
 def _signed(value: float, decimals: int) -> str:
-    return f"{value:+.{decimals}f}" if np.isfinite(value) else NOTHING
+    if not np.isfinite(value):
+        return NOTHING
+    text = f"{value:+.{decimals}f}"
+    return text[1:] if float(text) == 0.0 else text
 
 
 def difference_table(
-    title: str, points: Sequence[PointDifference], unit: str, states: Sequence[str] | None = None
+    title: str,
+    points: Sequence[PointDifference],
+    unit: str,
+    *,
+    note: str,
+    missing: Sequence[str] = (),
+    states: Sequence[str] | None = None,
 ) -> Table:
-    """Return differences and predicted sigmas by point; ``states`` adds a last column."""
+    """Return differences and predicted sigmas by point, then the points without coordinates in the block.
+
+    ``states`` adds a last column.
+    """
     axes = ("E", "N", "U")
     header = ("Point", *(f"d{a} [{unit}]" for a in axes), *(f"sigma {a} [{unit}]" for a in axes))
     header += (*(f"d{a} / sigma" for a in axes), "Rays")
     rows = [_difference_row(point) for point in points]
+    rows += [(name, *(NOTHING,) * 9, "0") for name in missing]
     if states is not None:
         header += ("State",)
-        rows = [(*row, state) for row, state in zip(rows, states, strict=True)]
-    note = "Difference: block minus survey. Sigma: predicted for the difference, block and survey together."
+        rows = [(*row, state) for row, state in zip(rows, (*states, *("lost",) * len(missing)), strict=True)]
     return Table(title=title, header=header, rows=tuple(rows), note=note, folded=len(rows) > COLLAPSE_ABOVE)
 
 
@@ -112,14 +165,25 @@ def _difference_row(point: PointDifference) -> tuple[str, ...]:
 
 def check_table(result: OrientedBlock) -> Table:
     """Return the check points."""
-    return difference_table("Check points", result.check, length_unit(result).thousandth)
+    missing = without_result(result.block.check_points, result.check)
+    note = "Difference: block minus survey. Sigma: predicted for the difference, block and survey together."
+    if missing:
+        note += f" Without coordinates in the block, and in no RMSE: {', '.join(missing)}."
+    unit = length_unit(result).thousandth
+    return difference_table("Check points", result.check, unit, note=note, missing=missing)
 
 
 def control_table(result: OrientedBlock) -> Table:
     """Return the control points, which take part in the adjustment, with their state."""
     used = result.adjustment.control_used
     states = [("used" if flag else "rejected") for flag in used] if len(used) == len(result.control) else None
-    return difference_table("Ground control points", result.control, length_unit(result).thousandth, states)
+    missing = without_result(result.block.control_points, result.control)
+    note = (
+        "Difference: adjusted minus surveyed. Sigma: predicted for this residual, far below that of the survey where "
+        "the point itself decides."
+    )
+    unit = length_unit(result).thousandth
+    return difference_table("Ground control points", result.control, unit, note=note, missing=missing, states=states)
 
 
 def accuracy_table(result: OrientedBlock) -> Table:
@@ -142,23 +206,30 @@ def _accuracy_row(name: str, a: Accuracy) -> tuple[str, ...]:
 
 def precision_table(result: OrientedBlock) -> Table:
     """Return the predicted precision of points and stations as median, 95 % and largest value."""
-    unit = length_unit(result).thousandth
+    unit = length_unit(result)
     xy, z = point_sigmas_m(result)
     centres, angles = exterior_sigmas(result)
-    mdeg = np.degrees(angles) * 1e3
-    rows = [
-        _range_row(f"Object points XY [{unit}]", 1e3 * xy),
-        _range_row(f"Object points Z [{unit}]", 1e3 * z),
-        _range_row(f"Projection centres XY [{unit}]", 1e3 * np.hypot(centres[:, 0], centres[:, 1])),
-        _range_row(f"Projection centres Z [{unit}]", 1e3 * centres[:, 2]),
-        *(_range_row(f"{name} [mdeg]", mdeg[:, axis]) for axis, name in enumerate(("omega", "phi", "kappa"))),
+    lengths = [("Object points XY", xy), ("Object points Z", z)]
+    lengths += [
+        ("Projection centres XY", np.hypot(centres[:, 0], centres[:, 1])),
+        ("Projection centres Z", centres[:, 2]),
     ]
-    return Table(
-        title="Predicted precision",
-        header=("Sigma of", "Number", "Least", "Median", "95 %", "Largest"),
-        rows=tuple(rows),
-        note="From the covariances of the adjustment, at the stated sigmas of the observations. 1000 mdeg = 1 degree.",
-    )
+    inner = relative_precision(result)
+    note = "From the covariances of the adjustment, at the stated sigmas of the observations."
+    if inner is not None:
+        lengths += [("Object points XY, within the block", inner.point_xy_m)]
+        lengths += [("Object points Z, within the block", inner.point_z_m)]
+        lengths += [("Projection centres XY, within the block", inner.centre_xy_m)]
+        lengths += [("Projection centres Z, within the block", inner.centre_z_m)]
+        note += f" Within the block: {WITHIN_THE_BLOCK}. A dash: lost in rounding beside the common shift."
+    elif result.adjustment.datum is Datum.GNSS:
+        note += " They hold the common shift of the GNSS positions; the precision within the block is not known."
+    names = ("omega", "phi", "kappa")
+    rows = [_range_row(name, values, (unit.whole, unit.thousandth)) for name, values in lengths]
+    rows += [_range_row(name, np.degrees(angles[:, axis]), ("deg", "mdeg")) for axis, name in enumerate(names)]
+    note += " 1000 mdeg = 1 degree."
+    header = ("Sigma of", "Number", "Least", "Median", "95 %", "Largest")
+    return Table(title="Predicted precision", header=header, rows=tuple(rows), note=note)
 
 
 def point_sigma_medians_m(result: OrientedBlock) -> tuple[float, float]:
@@ -167,10 +238,18 @@ def point_sigma_medians_m(result: OrientedBlock) -> tuple[float, float]:
     return (float(np.median(xy)), float(np.median(z))) if len(xy) else (float("nan"), float("nan"))
 
 
-def _range_row(name: str, values: Array) -> tuple[str, ...]:
+def median_length(values_m: Array, unit: LengthUnit) -> str:
+    """Return the median of lengths with its unit, "not known" where there is none."""
+    return length(float(np.median(values_m)), unit) if len(values_m) else "not known"
+
+
+def _range_row(name: str, values: Array, units: tuple[str, str]) -> tuple[str, ...]:
+    """Return a row in the whole unit where the median reaches one of it, in thousandths of it below."""
     v = values[np.isfinite(values)]
     marks = np.percentile(v, [0.0, 50.0, 95.0, 100.0]) if len(v) else np.full(4, np.nan)
-    return (name, str(len(v)), *(number(mark, 1) for mark in marks))
+    if marks[1] >= 1.0:
+        return (f"{name} [{units[0]}]", str(len(v)), *(number(mark, 3) for mark in marks))
+    return (f"{name} [{units[1]}]", str(len(v)), *(number(1e3 * mark, 1) for mark in marks))
 
 
 def stills_table(result: OrientedBlock) -> Table:
@@ -178,15 +257,17 @@ def stills_table(result: OrientedBlock) -> Table:
     unit, adjusted = length_unit(result), result.adjustment
     centres, angles = exterior_sigmas(result)
     mdeg, rays = np.degrees(angles) * 1e3, rays_of_images(result)
+    large = len(centres) > 0 and float(np.median(centres[:, 2])) >= 1.0
+    short, factor = (unit.whole, 1.0) if large else (unit.thousandth, 1e3)
     header = ("Still", "Strip", *(f"{axis} [{unit.whole}]" for axis in ("East", "North", "Up")))
-    header += ("omega [deg]", "phi [deg]", "kappa [deg]", *(f"s{a} [{unit.thousandth}]" for a in ("E", "N", "U")))
+    header += ("omega [deg]", "phi [deg]", "kappa [deg]", *(f"s{a} [{short}]" for a in ("E", "N", "U")))
     header += ("s omega [mdeg]", "s phi [mdeg]", "s kappa [mdeg]", "Rays")
     rows = []
     for row, name in enumerate(result.images):
         opk = np.degrees(omega_phi_kappa_from_rotation(adjusted.R_object_from_image[row]))
         strip = str(result.strips[row] + 1) if result.strips[row] >= 0 else NOTHING
         place = (number(value, 3) for value in adjusted.projection_centres_m[row])
-        sigmas = (*(thousandths(s) for s in centres[row]), *(number(s, 1) for s in mdeg[row]))
+        sigmas = (*(number(factor * s, 2 if large else 1) for s in centres[row]), *(number(s, 1) for s in mdeg[row]))
         rows.append((name, strip, *place, *(number(a, 4) for a in opk), *sigmas, str(rays[row])))
     note = "Projection centre in the local east-north-up frame; R = Rx(omega) Ry(phi) Rz(kappa) from image to object."
     return Table(title="Exterior orientation of each still", header=header, rows=tuple(rows), note=note, folded=True)
@@ -230,7 +311,10 @@ def _binning(result: OrientedBlock) -> float:
 
 
 def _sigma(value: float, decimals: int) -> str:
-    return number(value, decimals) if value > 0 else NOTHING
+    """Return a sigma with so many decimals, or more where it would show fewer than two digits."""
+    if not value > 0:
+        return NOTHING
+    return number(value, decimals) if value >= 9.5 * 10.0**-decimals else significant(value)
 
 
 def _parameter_label(name: str) -> str:
@@ -299,6 +383,8 @@ def groups_table(result: OrientedBlock) -> Table:
     rows = []
     for name in names:
         total, used = counts.get(name, (0, 0))
+        if not total and name not in adjusted.group_sigma0:
+            continue
         share = f"{100.0 * (total - used) / total:.1f} %" if total else NOTHING
         sigma0 = number(adjusted.group_sigma0.get(name, float("nan")), 3)
         rows.append((labels.get(name, name), str(total), str(used), share, sigma0))
@@ -307,7 +393,7 @@ def groups_table(result: OrientedBlock) -> Table:
         title="Observations",
         header=("Group", "Coordinates", "Used", "Rejected", "sigma0"),
         rows=tuple(rows),
-        note=f"Redundancy {adjusted.redundancy:.1f}; {adjusted.iterations} iterations.",
+        note=f"Redundancy {adjusted.redundancy:.0f}; {adjusted.iterations} iterations.",
     )
 
 
@@ -323,6 +409,8 @@ def points_table(result: OrientedBlock) -> Table:
     rows = []
     for kind, label in labels.items():
         mine = good & (result.point_kinds == kind)
+        if kind in (PointKind.CONTROL, PointKind.CHECK) and not np.any(mine):
+            continue
         mean = float(np.mean(rays[mine])) if np.any(mine) else float("nan")
         origins = [int(np.sum(mine & (result.point_origins == origin))) for origin in PointOrigin]
         rows.append((label, str(int(mine.sum())), *(str(count) for count in origins), number(mean, 1)))
@@ -335,10 +423,13 @@ def candidates_table(result: OrientedBlock) -> Table:
     labels = {"video": "Followed through the video", "features": "Feature matching"}
     rows = []
     for name, count in result.candidates.items():
+        if not count.found:
+            continue
         share = f"{100.0 * count.survived / count.found:.0f} %" if count.found else NOTHING
         rows.append((labels.get(name, name), str(count.found), str(count.survived), share))
     share = f"{100.0 * result.video_share:.0f} %" if np.isfinite(result.video_share) else NOTHING
-    note = f"Share of the used pass points that came through the video: {share}."
+    video = result.candidates.get("video")
+    note = f"Share of the used pass points that came through the video: {share}." if video and video.found else ""
     header = ("Candidates", "Found", "In the adjusted block", "Share")
     return Table(title="Candidate points by origin", header=header, rows=tuple(rows), note=note)
 
@@ -370,16 +461,22 @@ def comparison_table(result: OrientedBlock, comparison: PaperComparison) -> Tabl
     points = int(np.sum(natural & determined_points(result)))
     control = int(np.sum(result.adjustment.control_used))
     rows = (
-        ("Stills", "33", str(len(result.images))),
+        ("Stills", str(PUBLISHED_STILLS), str(len(result.images))),
         ("Ground control points", "3", str(control)),
         ("Check points", "11", str(ours.points)),
         ("Pass and tie points found", str(found), str(points)),
         ("RMSE XY at check points [mm]", number(1e3 * xy, 0), thousandths(ours.rmse_xy_m)),
         ("RMSE Z at check points [mm]", number(1e3 * z, 0), thousandths(ours.rmse_z_m)),
+        (
+            "RMSE XY / Z [GSD of the check points]",
+            NOTHING,
+            f"{number(ours.rmse_xy_gsd, 2)} / {number(ours.rmse_z_gsd, 2)}",
+        ),
     )
     note = (
         "Published: Anai et al., Automatic exterior orientation procedure for low-cost UAV photogrammetry, ISPRS "
         "Archives XXXIX-B7, 2012. This survey repeats that flight in a simulated world; it is not the same ground."
     )
+    note = f"{comparison.reduced} {note}".strip()
     header = (f"Flight: {comparison.described}", "Published", "This survey")
     return Table(title="Beside the published result", header=header, rows=rows, note=note)

@@ -7,6 +7,7 @@ from enum import Enum
 import numpy as np
 
 from uavkit.core.adjustment import Datum
+from uavkit.core.camera import INTERIOR_PARAMETERS
 from uavkit.core.result import OrientedBlock
 from uavkit.report.coverage import ground_surface, heights_above_ground_m
 from uavkit.report.measures import (
@@ -15,16 +16,20 @@ from uavkit.report.measures import (
     chi_square_bounds,
     determined_points,
     interior_correlation,
+    interior_prior_sigmas,
     length_unit,
     prediction_test,
     rays_of_points,
     strip_ties,
     view_tilts_deg,
+    without_result,
 )
 
 PRACTICAL_TOLERANCE = 0.05
 """A sigma0 within 5 % of 1 agrees for all practical purposes, however significant the difference may be."""
 FEW_TIES = 10
+FAR_FROM_PRIOR = 4.0
+"""Sigmas between a parameter of the interior orientation and its a priori value."""
 
 
 class Weight(Enum):
@@ -148,6 +153,12 @@ def _gnss_datum_sentence(result: OrientedBlock, control_points: int) -> str:
 
 
 def _check_points(result: OrientedBlock) -> Iterator[Remark]:
+    lost = without_result(result.block.check_points, result.check)
+    if lost and result.check:
+        yield watch(
+            f"{len(lost)} of {len(result.block.check_points)} check points ({_few(lost)}) have no coordinates in the "
+            f"block: too few marks in oriented stills, or their marks were rejected. They are in no RMSE; look at them."
+        )
     measured = accuracy(result.check)
     if not measured.points:
         yield limit("No check points: accuracy is predicted, not checked.")
@@ -168,12 +179,17 @@ def _check_points(result: OrientedBlock) -> Iterator[Remark]:
         yield good(f"The differences at the check points are {share}: the predicted precision holds.")
 
 
+def _few(names: tuple[str, ...], most: int = 8) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
 def _interior(result: OrientedBlock) -> Iterator[Remark]:
     lacking = result.adjustment.undetermined_interior
     if lacking:
         yield watch(
             f"The block does not determine {', '.join(lacking)} of the interior orientation: the prior value decides."
         )
+    yield from _far_from_prior(result)
     names, correlation = interior_correlation(result)
     # k1, k2 and k3 describe one curve together: their mutual correlation is natural and harmless.
     radial = {"k1", "k2", "k3"}
@@ -185,6 +201,22 @@ def _interior(result: OrientedBlock) -> Iterator[Remark]:
     ]
     if pairs:
         yield watch(f"Strongly correlated interior parameters: {', '.join(pairs)}. Do not use them singly elsewhere.")
+
+
+def _far_from_prior(result: OrientedBlock) -> Iterator[Remark]:
+    prior, sigma = result.block.interior.parameters(), interior_prior_sigmas(result)
+    change = result.adjustment.interior.parameters() - prior
+    far = [
+        f"{name} by {change[row] / sigma[row]:+.1f}"
+        for row, name in enumerate(INTERIOR_PARAMETERS)
+        if sigma[row] > 0 and abs(change[row]) > FAR_FROM_PRIOR * sigma[row]
+    ]
+    if far:
+        yield watch(
+            f"The adjusted interior orientation is far from the camera profile, in sigmas of the profile: "
+            f"{', '.join(far)}. The profile does not describe these stills (other camera, crop or zoom), or the block "
+            f"does not tell the interior orientation from the heights."
+        )
 
 
 def _doming(result: OrientedBlock) -> Iterator[Remark]:
@@ -247,4 +279,5 @@ def _network(result: OrientedBlock) -> Iterator[Remark]:
 
 def _notes(result: OrientedBlock) -> Iterator[Remark]:
     for text in (*result.block.notes, *result.notes):
-        yield Remark(weight=Weight.NOTE, text=text)
+        sentence = text[:1].upper() + text[1:]
+        yield Remark(weight=Weight.NOTE, text=sentence if sentence.endswith((".", "!", "?")) else f"{sentence}.")
