@@ -1,9 +1,16 @@
 """The command line: one line for what is wrong, the right exit status, and a chain that goes on after it was killed."""
 
+import errno
 import os
+import re
+import shutil
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from typer.testing import CliRunner
@@ -12,6 +19,9 @@ from uavkit import workflow
 from uavkit.cli import EXIT_DEFECT, EXIT_ERROR, EXIT_INTERRUPTED, INTERRUPTED, PlainProgress, app
 from uavkit.core.errors import DeviceError, InputError
 from uavkit.project import IngestOptions, Manifest, Project, Stage
+
+if TYPE_CHECKING:
+    from uavkit.simulate.survey import SimulatedSurvey
 
 ROOT = Path(__file__).resolve().parents[1]
 RUNNER = CliRunner()
@@ -176,3 +186,207 @@ def test_plain_progress_tells_begin_end_and_the_time_left(
     assert lines[1] == "stills: 5 of 100, about 1 min 35 s left"
     assert lines[-1] == "stills: 100 of 100"
     assert len(lines) == 21
+
+
+def damaged(path: Path, change: Callable[[bytes], bytes], name: str = "") -> None:
+    """Change a file's bytes, in place or into another file of the folder."""
+    path.with_name(name or path.name).write_bytes(change(path.read_bytes()))
+
+
+def replaced(path: Path, old: str, new: str) -> None:
+    """Change a text file."""
+    text = path.read_text(encoding="utf-8")
+    assert re.search(old, text)
+    path.write_text(re.sub(old, new, text), encoding="utf-8")
+
+
+@pytest.fixture
+def flight(smallest_survey: "SimulatedSurvey", tmp_path: Path) -> Path:
+    """Return a copy of the smallest simulated flight, to be damaged."""
+    return Path(shutil.copytree(smallest_survey.folder, tmp_path / "flight"))
+
+
+def ingest(flight: Path, *more: str) -> tuple[int, str]:
+    """Ingest a flight without its video, and return exit status and words."""
+    arguments = ["--images", str(flight / "stills"), "--positions", str(flight / "positions.kml")]
+    control = ["--control-points", str(flight / "control_points.csv")]
+    answer = RUNNER.invoke(app, ["ingest", str(flight.parent / "survey"), *arguments, *control, *more])
+    return answer.exit_code, answer.output
+
+
+def last_placemark(text: bytes) -> tuple[int, int]:
+    return text.rindex(b"<Placemark"), text.rindex(b"</Placemark>") + len(b"</Placemark>")
+
+
+def without_last_placemark(text: bytes) -> bytes:
+    start, end = last_placemark(text)
+    return text[:start] + text[end:]
+
+
+def with_last_placemark_twice(text: bytes) -> bytes:
+    start, end = last_placemark(text)
+    return text[:end] + text[start:end] + text[end:]
+
+
+def test_ingest_says_what_it_found(flight: Path) -> None:
+    status, words = ingest(flight)
+    assert status == 0
+    assert "2 stills of Ricoh GX200, 2 positions, 3 control points, 0 check points" in words
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "words"),
+    [
+        ("control_points.csv", lambda t: t.replace(b"EPSG:32654", b"EPSG:32630"), r"lie 6\d\d\d km from the nearest"),
+        ("control_points.csv", lambda t: t.replace(b"R00", b"X00"), r"none of its \d marks .*file of this flight"),
+        ("positions.kml", lambda t: t[: len(t) // 2], "no valid KML"),
+        ("stills/R0010001.JPG", lambda t: t[: len(t) // 2], "1 still is no block"),
+    ],
+    ids=["control in another CRS", "control of another flight", "half a KML", "one readable still"],
+)
+def test_files_that_cannot_be_used_end_as_one_line(
+    flight: Path, file: str, change: Callable[[bytes], bytes], words: str
+) -> None:
+    damaged(flight / file, change)
+    status, told = ingest(flight)
+    assert status == EXIT_ERROR
+    (line,) = (line for line in told.splitlines() if line.startswith("uavkit: "))
+    assert re.search(words, line)
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (("--camera", "Ricoh GX20"), "did you mean 'Ricoh GX200'"),
+        (("--crs", "EPSG:99999"), "no coordinate reference system"),
+        (("--video", "positions.kml"), "no video that can be read"),
+        (("--check-points", "positions.kml"), "no coordinate reference system"),
+        (("--check-points", "control_points.csv"), "both control and check"),
+    ],
+)
+def test_arguments_that_do_not_fit_end_as_one_line(
+    flight: Path, monkeypatch: pytest.MonkeyPatch, more: tuple[str, ...], words: str
+) -> None:
+    monkeypatch.chdir(flight)
+    status, told = ingest(flight, *more)
+    assert status == EXIT_ERROR
+    (line,) = (line for line in told.splitlines() if line.startswith("uavkit: "))
+    assert words in line
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "words"),
+    [
+        ("stills/R0010001.JPG", (lambda t: t[: len(t) // 2], "R0019999.JPG"), "R0019999.JPG: the file is truncated"),
+        ("stills/R0010001.JPG", (lambda _: b"", "R0019999.JPG"), "R0019999.JPG: the file is empty"),
+        ("positions.kml", (without_last_placemark,), "1 positions are fewer than 2 stills"),
+        ("positions.kml", (with_last_placemark_twice,), "3 positions are more than 2 stills"),
+        (
+            "control_points.csv",
+            (lambda t: t.replace(b"R0010002", b"R001002", 1),),
+            "is none of the stills; did you mean",
+        ),
+        ("control_points.csv", (lambda t: b"\n".join(r for r in t.split(b"\n") if r[:2] != b"G3"),), "free network"),
+    ],
+    ids=["truncated still", "empty still", "position missing", "position doubled", "unknown image", "2 control points"],
+)
+def test_what_is_left_out_is_told_and_kept_for_the_report(
+    flight: Path, file: str, change: tuple[Callable[[bytes], bytes], str], words: str
+) -> None:
+    if words == "free network":
+        replaced(flight / "positions.kml", r"(?s)<Placemark.*</Placemark>\s*(?=<Placemark)", "")
+    damaged(flight / file, *change)
+    status, told = ingest(flight)
+    assert status == 0
+    (note,) = (line for line in told.splitlines() if words in line)
+    assert note.startswith("note: ")
+    kept = (flight.parent / "survey" / "ingest" / "block.json").read_text(encoding="utf-8")
+    assert words in kept
+
+
+def test_two_cameras_are_refused(flight: Path) -> None:
+    from PIL import Image
+
+    Image.new("L", (320, 240)).save(flight / "stills" / "other.jpg")
+    status, told = ingest(flight)
+    assert status == EXIT_ERROR
+    assert "two cameras or sizes are mixed" in told
+
+
+def test_a_file_in_place_of_the_survey_is_refused(flight: Path) -> None:
+    still = flight / "stills" / "R0010001.JPG"
+    answer = RUNNER.invoke(app, ["ingest", str(still), "--images", str(still.parent)])
+    assert answer.exit_code == EXIT_ERROR
+    assert answer.output == f"uavkit: {still}: is a file: name a folder for the survey\n"
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [(errno.ENOSPC, "the disk is full"), (errno.EROFS, "cannot be written (Read-only file system)")],
+)
+def test_a_disk_that_takes_nothing_is_named(
+    flight: Path, monkeypatch: pytest.MonkeyPatch, number: int, words: str
+) -> None:
+    def refuse(file: Path, *_: object, **__: object) -> int:
+        raise OSError(number, os.strerror(number), str(file))
+
+    monkeypatch.setattr(Path, "write_text", refuse)
+    status, told = ingest(flight)
+    assert status == EXIT_ERROR
+    assert words in told
+    assert "survey" in told
+
+
+def test_a_second_run_is_kept_out(flight: Path) -> None:
+    with Project(flight.parent / "survey").locked():
+        status, told = ingest(flight)
+    assert status == EXIT_ERROR
+    assert f"another run (process {os.getpid()} on " in told
+
+
+def test_the_interrupt_key_ends_a_run_with_one_line(tmp_path: Path) -> None:
+    """Ctrl-C at a terminal: the signal reaches Python, threads end, and the line says how to go on."""
+    script = (
+        "import sys, time\n"
+        "from uavkit import cli, workflow\n"
+        "def wait():\n"
+        "    print('at work', flush=True)\n"
+        "    time.sleep(60)\n"
+        "workflow.cameras = wait\n"
+        "sys.argv = ['uavkit', 'cameras']\n"
+        "cli.main()\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    run = subprocess.Popen(
+        [sys.executable, "-c", "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n" + script],
+        env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert run.stdout is not None
+    assert run.stdout.readline() == "at work\n"
+    began_s = time.monotonic()
+    run.send_signal(signal.SIGINT)
+    _, words = run.communicate(timeout=60)
+    assert time.monotonic() - began_s < 30
+    assert run.returncode == EXIT_INTERRUPTED
+    assert words == f"uavkit: {INTERRUPTED}\n"
+
+
+@pytest.mark.parametrize("option", [("--field-order", "progressive"), ("--frames-between-stills", "5")])
+def test_simulate_refuses_what_no_finder_sends(tmp_path: Path, option: tuple[str, str]) -> None:
+    answer = RUNNER.invoke(app, ["simulate", str(tmp_path / "f"), *option])
+    assert answer.exit_code == EXIT_ERROR
+    assert not (tmp_path / "f").exists()
+
+
+def test_simulate_hands_its_options_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: dict[str, object] = {}
+
+    def note(out: Path, values: dict[str, object], progress: object) -> str:
+        given.update(values)
+        return "uavkit ingest ..."
+
+    monkeypatch.setattr(workflow, "simulate", note)
+    arguments = ["--field-order", "top", "--frames-between-stills", "45", "--stations", "4", "--strips", "2"]
+    answer = RUNNER.invoke(app, ["simulate", str(tmp_path), *arguments])
+    assert answer.exit_code == 0
+    assert (given["field_order"], given["frames_between_stills"], given["stations_per_strip"]) == ("top", 45.0, 4)

@@ -90,7 +90,7 @@ def test_new_and_missing_pictures_are_named(project: Project) -> None:
     assert why(project, Stage.INGEST) == "images: c.jpg is new"
     for picture in images.iterdir():
         picture.unlink()
-    assert why(project, Stage.INGEST) == "images: a.jpg and 1 more files are gone"
+    assert why(project, Stage.INGEST) == "images: a.jpg and 1 other file are gone"
 
 
 def test_a_touched_or_copied_picture_is_not_out_of_date(project: Project) -> None:
@@ -247,6 +247,24 @@ def test_the_lock_of_a_killed_run_is_no_lock(project: Project, other_run: subpro
 def test_the_lock_is_free_again_after_an_error(project: Project) -> None:
     with pytest.raises(InputError), project.locked():
         raise InputError("no")
+    with project.locked():
+        pass
+
+
+def test_a_full_disk_does_not_break_the_lock(project: Project, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lock's text only tells who holds it; without room for it the stage itself says that the disk is full."""
+
+    def full(*_: Any) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", full)
+        with (
+            project.locked(),
+            pytest.raises(InputError, match="another run is at work"),
+            Project(project.folder).locked(),
+        ):
+            pytest.fail("the lock was given twice")
     with project.locked():
         pass
 

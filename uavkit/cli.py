@@ -24,6 +24,8 @@ EXIT_ERROR = 2
 EXIT_DEFECT = 1
 EXIT_INTERRUPTED = 130
 INTERRUPTED = "interrupted; run the same command again to go on"
+WIDTH_OF_FILES = 400
+"""Columns of a table that does not go to a terminal: a reason is not broken into lines there."""
 LINES_EVERY_S = 5.0
 """Progress that does not go to a terminal: a line at the start and end of each step, and this often in between."""
 
@@ -78,7 +80,11 @@ Survey = Annotated[Path, typer.Argument(help="Folder of the survey.", show_defau
 Workers = Annotated[int, typer.Option(min=1, max=1024, help="Threads; the result does not depend on it.")]
 Settings = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="SECTION.OPTION=VALUE", help="An option of the processing core; may be repeated."),
+    typer.Option(
+        "--set",
+        metavar="SECTION.OPTION=VALUE",
+        help="An option of the processing core; may be repeated. What is not given has its default.",
+    ),
 ]
 CORES = os.cpu_count() or 1
 
@@ -111,6 +117,12 @@ def simulate(
     video_standard: Annotated[
         Literal["ntsc", "pal", "none"], typer.Option(help="Television standard of the finder's video, or no video.")
     ] = "ntsc",
+    field_order: Annotated[
+        Literal["top", "bottom"], typer.Option(help="Field of a frame that comes first.")
+    ] = "bottom",
+    frames_between_stills: Annotated[
+        float, typer.Option(help="Video frames from one still to the next, 30 to 300; fewer are a faster flight.")
+    ] = 90.0,
     seed: Annotated[int, typer.Option(help="Of everything that is random.")] = 1,
     workers: Workers = CORES,
 ) -> None:
@@ -127,6 +139,8 @@ def simulate(
                 "stations_per_strip": stations,
                 "gnss_outliers": min(3, strips * stations // 11),
                 "video_standard": video_standard,
+                "field_order": field_order,
+                "frames_between_stills": frames_between_stills,
                 "seed": seed,
                 "workers": workers,
             },
@@ -242,7 +256,7 @@ def status(survey: Survey) -> None:
         table.add_column(heading)
     for entry in Project(survey).status():
         table.add_row(entry.stage.value, entry.standing.value, entry.why)
-    Console(highlight=False).print(table)
+    Console(highlight=False, width=None if sys.stdout.isatty() else WIDTH_OF_FILES).print(table)
 
 
 @app.command()

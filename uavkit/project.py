@@ -13,7 +13,7 @@ import sys
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -189,6 +189,8 @@ class Project:
 
         Raises InputError where another run is at work here.
         """
+        if self.folder.exists() and not self.folder.is_dir():
+            raise InputError(f"{self.folder}: is a file: name a folder for the survey")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             stream = (self.folder / LOCK).open("a+", encoding="utf-8")
@@ -209,9 +211,10 @@ class Project:
 
     def _sign_lock(self, stage: str) -> None:
         if self._lock is not None:
+            content = json.dumps({"process": os.getpid(), "computer": socket.gethostname(), "stage": stage})
             self._lock.truncate(0)
-            self._lock.write(json.dumps({"process": os.getpid(), "computer": socket.gethostname(), "stage": stage}))
-            self._lock.flush()
+            with suppress(OSError):  # a full disk: the lock holds without its text, and the stage says what is wrong
+                os.write(self._lock.fileno(), content.encode())
 
     @contextmanager
     def running(self, stage: Stage) -> Iterator[None]:
@@ -281,8 +284,10 @@ class Project:
         )
         for names, verb in ((gone, "gone"), (new, "new"), (changed, "changed")):
             if names:
-                more = f" and {len(names) - 1} more files are {verb}" if len(names) > 1 else f" is {verb}"
-                return f"{names[0]}{more}"
+                others = (
+                    f" and {len(names) - 1} other file{'s' if len(names) > 2 else ''} are" if len(names) > 1 else " is"
+                )
+                return f"{names[0]}{others} {verb}"
         return ""
 
     def _active_stage(self) -> str:

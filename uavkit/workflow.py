@@ -25,6 +25,7 @@ from uavkit.project import IngestOptions, Manifest, Original, Project, Stage, St
 SIMULATION_LABEL = "simulation.json"
 """Beside simulated stills: which flight they repeat. It holds no truth."""
 DEMO: Mapping[str, Any] = {
+    "flight": "trace",
     "scale": 0.25,
     "strips": 2,
     "stations_per_strip": 6,
