@@ -1,6 +1,7 @@
 """From an adjusted network to the result that is handed on: kinds of points, differences, counts, pictures."""
 
 import resource
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -239,4 +240,5 @@ def _code_pictures(
 
 def peak_memory_mb() -> float:
     """Return the largest resident memory of this process so far."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    bytes_per_unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * bytes_per_unit / 1024.0**2
