@@ -67,7 +67,9 @@ def adjust_block(
         state, weights = tukey_solution(system, state, weights, options, progress)
         # Wide at first: what took no part so far is judged by redundancy numbers that are only nearly right.
         wide = max(options.tukey_c, options.reject_above)
-        rule = CutRule(reject_above=wide, may_return=True, gross_above=wide)
+        # Control is not judged before the block has converged with all of it at full weight.
+        every = system.full_weights().control.size
+        rule = CutRule(reject_above=wide, may_return=True, gross_above=wide, least_control=every)
         state = reintersected(system, state, 1.0, lost_points(system, weights))
         weights = revived(system, weights)
         weights = cut_weights(system, state, weights, precision_at(system, state, weights), rule)

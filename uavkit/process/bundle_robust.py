@@ -2,6 +2,9 @@
 
 A ray is judged as a whole by the larger of its two |z|, a GNSS fix or control point by the largest of its three, with
 z = v / (s sigma sqrt(r)): r the redundancy number, s the robust scale of the group, which serves the weights only.
+
+Control points fix the datum, so robust weights must not throw it away: they keep Huber's weights until the block has
+converged, then go one at a time, the worst first, and as many stay as fix the datum (``LEAST_CONTROL``).
 """
 
 from collections.abc import Callable
@@ -49,6 +52,13 @@ ANCHOR = 0.5
 FAR_OFF = 50.0
 """A ray rejected at more sigmas than this cannot be the good one that two wrong ones outvoted."""
 TUKEY_ROUNDS = 8
+HUBER_K = 1.345
+LEAST_CONTROL = 3
+"""So many control points fix the datum without trust in GNSS; the cut leaves at least these, or all of fewer."""
+MOST_CONTROL_SCALE = 2.0
+"""Control counts at its stated sigmas, twice these at most: a group so small would hide a wrong point in its scale."""
+CHI_SHARE = 0.9
+"""The root of chi-square with 3 degrees of freedom, times this, passes 4 as rarely as the largest of three |z| does."""
 REJECTION_ROUNDS = 14
 RETURNING_ROUNDS = 6
 """Rounds in which rejected observations may come back; later ones only reject, so that the rounds end."""
@@ -78,6 +88,11 @@ class Normalised:
     def scales(self) -> tuple[float, float, float]:
         """Return the scales of rays, GNSS and control."""
         return self.scale(0), self.scale(1), self.scale(2)
+
+    @property
+    def trusted_scales(self) -> tuple[float, float, float]:
+        """Return the scales, that of control not above ``MOST_CONTROL_SCALE``."""
+        return self.scale(0), self.scale(1), min(self.scale(2), MOST_CONTROL_SCALE)
 
 
 def normalised(
@@ -117,14 +132,14 @@ def _weighted(
     system: BundleSystem,
     found: Normalised,
     scales: tuple[Array | float, float, float],
-    functions: tuple[WeightFunction, WeightFunction],
+    functions: tuple[WeightFunction, WeightFunction, WeightFunction],
 ) -> Weights:
-    """Return weight functions, of rays and of the rest, at the residuals over their scales."""
+    """Return weight functions, of rays, GNSS and control, at the residuals over their scales."""
     full, largest = system.full_weights(), found.largest
     parts = [
         np.nan_to_num(function(values / scale), nan=0.0) * part / np.asarray(scale) ** 2
         for function, values, scale, part in zip(
-            (functions[0], functions[1], functions[1]),
+            functions,
             largest,
             scales,
             (full.rays, full.gnss, full.control),
@@ -192,7 +207,8 @@ def robust_start(system: BundleSystem, state: State) -> tuple[State, Weights]:
             anchored = replace(system, anchor=_anchor(system, state, float(np.median(scales))))
         found = normalised(system, state, weights, leverages, START_REDUNDANCY)
         _, gnss, control = found.scales
-        functions = partial(tukey_weight, c=START_C), partial(huber_weight, k=1.345)
+        huber = partial(huber_weight, k=HUBER_K)
+        functions = partial(tukey_weight, c=START_C), huber, huber
         weights = _weighted(system, found, (by_ray, gnss, control), functions)
         step = gauss_newton_step(anchored, state, weights, damping)
         state, damping = step.state, step.damping
@@ -253,7 +269,7 @@ def tukey_solution(
     system: BundleSystem, state: State, weights: Weights, options: AdjustmentOptions, progress: Progress = silent
 ) -> tuple[State, Weights]:
     """Return the solution with Tukey's weights, redundancy numbers and scales renewed in each round."""
-    function = partial(tukey_weight, c=options.tukey_c)
+    tukey, huber = partial(tukey_weight, c=options.tukey_c), partial(huber_weight, k=HUBER_K)
     # The start held the orientations to their approximations: only without that are residuals as small as their
     # redundancy numbers say, which matters most to the few control points that fix the datum.
     state, damping = _stepped(system, state, weights, 0.0)
@@ -263,7 +279,7 @@ def tukey_solution(
         leverages = _leverages(precision_at(system, state, weights))
         state = reintersected(system, state, normalised(system, state, weights, leverages).scale(0), lost)
         found = normalised(system, state, weights, leverages)
-        weights = _weighted(system, found, found.scales, (function, function))
+        weights = _weighted(system, found, found.trusted_scales, (tukey, tukey, huber))
         state, damping = _stepped(system, state, weights, damping)
         if number > 1 and float(np.max(np.abs(weights.rays - last.rays), initial=0.0)) < 0.05:
             break
@@ -273,21 +289,83 @@ def tukey_solution(
 def cut_weights(system: BundleSystem, state: State, weights: Weights, precision: Precision, rule: "CutRule") -> Weights:
     """Return weights of 1 within and 0 beyond the cut; of a point's used rays only the worst goes at once."""
     found = normalised(system, state, weights, _leverages(precision))
-    rays, gnss, control = (values / scale for values, scale in zip(found.largest, found.scales, strict=True))
+    scales = found.trusted_scales
+    rays, gnss = (values / scale for values, scale in zip(found.largest[:2], scales[:2], strict=True))
+    control = control_tests(system, found, weights, precision) / scales[2]
     full, used = system.full_weights(), weights.rays > 0.0
     inside = rays <= rule.reject_above
-    worst = np.zeros(len(system.rays.start) - 1)
     magnitude = np.where(used, np.nan_to_num(rays, nan=np.inf), 0.0)
+    kept = kept_control(system, weights, (control, magnitude), rule)
+    if np.any((weights.control == 1.0) & ~kept):
+        return replace(weights, control=full.control * kept)
+    worst, gross = np.zeros(len(system.rays.start) - 1), np.full(len(system.rays.start) - 1, rule.gross_above)
+    _judge_control_before_rays(system, np.where(weights.control > 0.0, control, 0.0), rule, (worst, gross))
     np.maximum.at(worst, system.point_of_ray, magnitude)
-    spared = used & (magnitude < worst[system.point_of_ray]) & (magnitude < rule.gross_above)
+    spared = used & (magnitude < worst[system.point_of_ray]) & (magnitude < gross[system.point_of_ray])
     keep = used & (inside | spared)
     if rule.may_return:
         keep |= inside
     return Weights(
         rays=keep.astype(np.float64),
         gnss=full.gnss * (gnss <= rule.reject_above) * (rule.may_return | (weights.gnss > 0.0)),
-        control=full.control * (control <= rule.reject_above) * (rule.may_return | (weights.control > 0.0)),
+        control=full.control * kept,
     )
+
+
+def _judge_control_before_rays(
+    system: BundleSystem, control: Array, rule: "CutRule", limits: tuple[Array, Array]
+) -> None:
+    """Raise the limits (m,), worst |z| and gross, of points whose control disagrees: their rays wait for its fate.
+
+    Otherwise a wrong control point would hold its place and cast off its rays, and look faultless without them.
+    """
+    given = system.given.control
+    if given is None or not system.uses_control:
+        return
+    worst, gross = limits
+    disagrees = ~(control <= rule.reject_above)
+    np.maximum.at(worst, given.point_index, np.nan_to_num(control, nan=np.inf))
+    gross[given.point_index[disagrees]] = np.inf
+
+
+def control_tests(system: BundleSystem, found: Normalised, weights: Weights, precision: Precision) -> Array:
+    """Return sqrt(v' Q_vv^-1 v) of each control point (c,), reduced to be read like the largest |z| of three.
+
+    Unlike single coordinates this statistic is largest for the wrong one of several points, however much it bends the
+    block (Baarda 1968; Foerstner 1987).
+    """
+    given = system.given.control
+    if given is None or not system.uses_control:
+        return np.zeros(len(weights.control))
+    z = found.z[2] * np.sqrt(found.variance[2])
+    sigma = given.sigma_m[:, :, None] * given.sigma_m[:, None, :]
+    taken = np.where(weights.control > 0.0, -1.0, 1.0)[:, None, None]
+    variance = np.eye(3) + taken * np.nan_to_num(precision.point_covariances_m2[given.point_index]) / sigma
+    values, vectors = np.linalg.eigh(variance)
+    along = np.einsum("cji,cj->ci", vectors, z)
+    return np.asarray(CHI_SHARE * np.sqrt(np.sum(along**2 / np.maximum(values, LEAST_REDUNDANCY), axis=1)))
+
+
+def kept_control(system: BundleSystem, weights: Weights, tests: tuple[Array, Array], rule: "CutRule") -> Flags:
+    """Return which control points (c,) stay: all but the worst beyond the cut, and enough for the datum.
+
+    One at a time, for a wrong control point bends the block and spoils the residuals of the right ones; and not while
+    one of its own rays, (k,), is worse.
+    """
+    given = system.given.control
+    z, of_rays = tests
+    if given is None or not system.uses_control:
+        return np.zeros(len(z), dtype=np.bool_)
+    inside, used, points = z <= rule.reject_above, weights.control > 0.0, len(system.rays.start) - 1
+    keep = used | inside if rule.may_return else used
+    worst = np.zeros(points)
+    np.maximum.at(worst, system.point_of_ray, of_rays)
+    seen = np.bincount(system.point_of_ray, weights.rays > 0.0, minlength=points)[given.point_index]
+    held = keep & (seen > 0)
+    bad = held & used & ~inside & ~(worst[given.point_index] > z)
+    if np.any(bad) and np.count_nonzero(held) > min(rule.least_control, len(z)):
+        keep = keep & (np.arange(len(z)) != int(np.argmax(np.where(bad, np.nan_to_num(z, nan=np.inf), -1.0))))
+    return np.asarray(keep)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -298,6 +376,8 @@ class CutRule:
     may_return: bool
     gross_above: float = np.inf
     """Beyond this an observation goes at once, even if another of its point is worse."""
+    least_control: int = LEAST_CONTROL
+    """So many control points stay, or all of fewer."""
 
 
 def without_unchecked(system: BundleSystem, state: State, weights: Weights) -> Weights:
