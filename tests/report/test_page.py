@@ -153,7 +153,7 @@ def test_comparison_states_the_published_flight(page: Page) -> None:
 def test_reasons_and_notes_are_told(page: Page) -> None:
     assert page.table("Still", "Reason") == [["X99.JPG", "fewer than 8 points in common with any other still"]]
     assert "Two frames of the video were damaged." in page.text
-    assert "the video has no sound of the shutter" in page.text
+    assert "The video has no sound of the shutter." in page.text
     assert "does not determine k3" in page.text
 
 

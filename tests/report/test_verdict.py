@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ def said(result: OrientedBlock, weight: Weight | None = None) -> str:
     return " | ".join(remark.text for remark in remarks(result) if weight in (None, remark.weight))
 
 
-def adjusted(result: OrientedBlock, **changes: object) -> OrientedBlock:
+def adjusted(result: OrientedBlock, **changes: Any) -> OrientedBlock:
     return replace(result, adjustment=replace(result.adjustment, **changes))
 
 
