@@ -247,9 +247,10 @@ def test_ray_sigma_covers_the_true_error(noise: float, quality: int, contrast: f
     plane = RaySigmaOptions(surface_px=0.0)
     sigma_pair = ray_sigma(both.forward, both.return_miss_px, options=plane)[ok] * np.sqrt(2)
     z = (both.forward.target_px - pair.truth_px)[ok] / sigma_pair
-    assert 0.5 < np.sqrt((z**2).mean()) < 1.3
+    # JPEG of quality 75 correlates the noise of a weak texture, which formal sigmas take as white.
+    assert 0.7 < np.sqrt((z**2).mean()) < (1.3 if quality > 90 else 1.5)
     assert np.isnan(ray_sigma(both.forward, both.return_miss_px)[~ok]).all()
-    assert (ray_sigma(both.forward, both.return_miss_px)[ok] > 0.03 / np.sqrt(2)).all()
+    assert (ray_sigma(both.forward, both.return_miss_px)[ok] > RaySigmaOptions().surface_px / np.sqrt(2)).all()
 
 
 def test_ray_sigma_takes_the_miss_of_its_class() -> None:
@@ -259,7 +260,7 @@ def test_ray_sigma_takes_the_miss_of_its_class() -> None:
     classes = np.where(result.ok, np.arange(200) % 2, -1)
     classes[:5] = 7  # too few to speak for themselves
     miss = rng.normal(0, np.where(classes == 1, 0.2, 0.02)[:, None], (200, 2))
-    sigma = ray_sigma(result, miss, classes, RaySigmaOptions(surface_px=0.0, formal_scale=0.0))
+    sigma = ray_sigma(result, miss, classes, RaySigmaOptions(surface_px=0.0, formal_scale=0.0, miss_scale=1.0))
     assert np.nanmedian(sigma[classes == 1]) == pytest.approx(0.2 / np.sqrt(2), rel=0.2)
     assert np.nanmedian(sigma[classes == 0]) == pytest.approx(0.02 / np.sqrt(2), rel=0.2)
     assert np.nanmedian(sigma[classes == 7]) == pytest.approx(0.015 / np.sqrt(2))

@@ -272,7 +272,7 @@ def _tie(
             growing = _regrown(growing, updated(network, adjusted))
         with place.step("tie points"):
             tied = matching.match(candidates, growing, adjusted, known=None if turn == 1 else tied)
-            apart = points_apart(tied, _LEAST_DISTANCE * place.options.measurement.window_px)
+            apart = points_apart(tied, 0.5 * place.options.measurement.window_px)
             candidates, tied = candidates.only_points(apart), tied.only_points(apart)
     with place.step("free network"):
         growing = without_weak_stills(growing, tied, marked)

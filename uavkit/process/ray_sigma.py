@@ -1,4 +1,12 @@
-"""Variance components: what a block says of the a priori sigmas of its rays, by texture and angle."""
+"""Variance components: what a block says of the a priori sigmas of its rays, by texture and angle.
+
+Sigmas are the same along the epipolar line and across it. Relief within the matching window does move a match along
+the epipolar line, by twice the matching error in stills of 4 mm on the ground; but all rays of a point are matched
+against one window, which sees the ground at one mean depth, and so they move together: the implied depths correlate by
+0.7 to 0.95 between rays of a point, whatever their directions, and with the truth of orientation given the residuals of
+points of three and more rays have the same variance factor along the epipolar line as across it (0.97 and 0.97).
+What remains is no error of rays: the point lies where the window sees the ground, not at the ground in its centre.
+"""
 
 from dataclasses import dataclass
 
