@@ -52,6 +52,10 @@ ANCHOR = 0.5
 FAR_OFF = 50.0
 """A ray rejected at more sigmas than this cannot be the good one that two wrong ones outvoted."""
 TUKEY_ROUNDS = 8
+STILL = 0.01
+"""Steps whose unknowns change by less than this many of their sigmas, RMS, need no other before weights are renewed."""
+SETTLED_SHARE = 1e-3
+"""Robust weights are settled where no more than this share of them still changes by 0.05."""
 HUBER_K = 1.345
 LEAST_CONTROL = 3
 """So many control points fix the datum without trust in GNSS; the cut leaves at least these, or all of fewer."""
@@ -257,10 +261,11 @@ def _anchor(system: BundleSystem, state: State, scale: float) -> Anchor:
 
 def _stepped(system: BundleSystem, state: State, weights: Weights, damping: float) -> tuple[State, float]:
     """Return the state after up to four steps at fixed weights, and the damping."""
+    unknowns = 6 * len(state.centres) + 3 * len(state.points)
     for _ in range(4):
         step = gauss_newton_step(system, state, weights, damping)
         state, damping = step.state, step.damping
-        if step.size < 0.1:
+        if step.size < STILL * np.sqrt(unknowns):
             break
     return state, damping
 
@@ -281,7 +286,7 @@ def tukey_solution(
         found = normalised(system, state, weights, leverages)
         weights = _weighted(system, found, found.trusted_scales, (tukey, tukey, huber))
         state, damping = _stepped(system, state, weights, damping)
-        if number > 1 and float(np.max(np.abs(weights.rays - last.rays), initial=0.0)) < 0.05:
+        if number > 1 and np.mean(np.abs(weights.rays - last.rays) > 0.05) < SETTLED_SHARE:
             break
     return state, weights
 

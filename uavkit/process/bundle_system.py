@@ -1,8 +1,10 @@
 """The observation equations of a block: its unknowns, one Gauss-Newton step, and the precision at a solution."""
 
+import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TypeVar
 
 import numpy as np
@@ -13,7 +15,7 @@ from uavkit.core.arrays import Array, Flags, Indices
 from uavkit.core.errors import AdjustmentError
 from uavkit.process.kernels import bundle_normals as kernels
 from uavkit.process.kernels.bundle_normals import Coordinates, RayTable, Reduced, Unknowns
-from uavkit.process.kernels.bundle_precision import Inverse, point_precision
+from uavkit.process.kernels.bundle_precision import Inverse, fixed_leverage, point_precision
 from uavkit.process.normal_equations import (
     Factoriser,
     InnerDatum,
@@ -200,8 +202,13 @@ def in_chunks(system: BundleSystem, work: Callable[[int, int], T]) -> Iterable[T
     if rays < SMALL:
         return [work(0, points)]
     bounds = [0, *(int(np.searchsorted(start, rays * part // CHUNKS)) for part in range(1, CHUNKS)), points]
-    with ThreadPoolExecutor(CHUNKS) as pool:
-        return list(pool.map(work, bounds[:-1], bounds[1:]))
+    return list(_pool(os.getpid()).map(work, bounds[:-1], bounds[1:]))
+
+
+@cache
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Return the threads of a process, made once (a fork has none of its parent's); they share out the chunks."""
+    return ThreadPoolExecutor(min(CHUNKS, os.cpu_count() or 1), thread_name_prefix=f"bundle-{process}")
 
 
 def misclosures(system: BundleSystem, state: State) -> Misclosures:
@@ -504,26 +511,11 @@ def precision_at(system: BundleSystem, state: State, weights: Weights) -> Precis
 
 def local_leverage(system: BundleSystem, state: State, weights: Weights) -> tuple[Array, Array, Array]:
     """Return leverages of rays, GNSS fixes and control points as if the orientations were known exactly."""
-    n, b, pairs = len(state.centres), system.border, len(system.pattern.column)
-    none = Inverse(
-        system.pattern.row_start, system.pattern.column, np.zeros((pairs, 6, 6)), np.zeros((n, 6, b)), np.zeros((b, b))
-    )
     coordinates = control_coordinates(system, state, weights)
     covariances, leverage = np.empty((len(state.points), 3, 3)), np.empty((len(system.order), 2))
 
     def work(first: int, last: int) -> None:
-        point_precision(
-            system.rays,
-            state.unknowns,
-            weights.rays,
-            system.free,
-            coordinates,
-            first,
-            last,
-            none,
-            covariances,
-            leverage,
-        )
+        fixed_leverage(system.rays, state.unknowns, weights.rays, coordinates, first, last, covariances, leverage)
 
     list(in_chunks(system, work))
     gnss = 0 if system.given.gnss is None else len(system.given.gnss)

@@ -13,11 +13,14 @@ from scipy import linalg
 
 from uavkit.core.arrays import Array, Indices
 from uavkit.core.errors import AdjustmentError
+from uavkit.process.kernels import bundle_factor
 from uavkit.process.kernels.bundle_normals import Reduced
 from uavkit.process.kernels.bundle_precision import Inverse
 
 LEAST_EIGENVALUE = 2e-14
 """Of the normal matrix scaled to unit diagonal before points are eliminated; rounding leaves about 1e-15."""
+SMALL = 500
+"""Matrices of up to so many rows are factored without LAPACK, whose threads would only wait for one another."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,16 +135,13 @@ class DenseFactor:
     def solve(self, right: Array) -> Array:
         """Return the solution (u, ...)."""
         scale = self.scale.reshape(-1, *(1,) * (right.ndim - 1))
-        solution = scale * linalg.cho_solve((self.cholesky, True), scale * right, check_finite=False)
+        solution = scale * solve_factored(self.cholesky, scale * right)
         return np.asarray(solution - self.null_space @ (self.null_space.T @ right))
 
     def inverse(self) -> Inverse:
         """Return the inverse at the pattern of the blocks."""
         reduced, n = self.reduced, len(self.reduced.border)
-        full, info = linalg.lapack.dpotri(self.cholesky, lower=1)
-        if info != 0:
-            raise AdjustmentError("the normal equations cannot be inverted")
-        full = np.tril(full) + np.tril(full, -1).T
+        full = invert_factored(self.cholesky)
         full *= self.scale * self.scale[:, None]
         full -= self.null_space @ self.null_space.T
         row = np.repeat(np.arange(n), np.diff(reduced.row_start))
@@ -171,10 +171,40 @@ def factor_dense(reduced: Reduced, damping: float, datum: "InnerDatum | None") -
         free = datum.null_space / np.sqrt(strength)
     scale = 1.0 / np.sqrt(diagonal)
     matrix *= scale * scale[:, None]
-    cholesky, info = linalg.lapack.dpotrf(matrix, lower=1, clean=1)
-    if info != 0 or least_eigenvalue(cholesky) < LEAST_EIGENVALUE:
+    cholesky, regular = cholesky_factor(matrix)
+    if not regular or least_eigenvalue(cholesky) < LEAST_EIGENVALUE:
         raise AdjustmentError(describe_defect(reduced, matrix))
     return DenseFactor(reduced=reduced, cholesky=cholesky, scale=scale, null_space=free)
+
+
+def cholesky_factor(matrix: Array) -> tuple[Array, bool]:
+    """Return the lower Cholesky factor (u, u), and whether the matrix is positive definite."""
+    if len(matrix) <= SMALL:
+        factor = np.empty_like(matrix)
+        return factor, bundle_factor.cholesky(matrix, factor)
+    factor, info = linalg.lapack.dpotrf(matrix, lower=1, clean=1)
+    return factor, info == 0
+
+
+def solve_factored(cholesky: Array, right: Array) -> Array:
+    """Return the solution (u, ...) of a right-hand side (u, ...)."""
+    if len(cholesky) > SMALL or right.ndim > 1:
+        return np.asarray(linalg.cho_solve((cholesky, True), right, check_finite=False))
+    solution = right.copy()
+    bundle_factor.solve(cholesky, solution)
+    return solution
+
+
+def invert_factored(cholesky: Array) -> Array:
+    """Return the inverse (u, u) of the matrix that was factored."""
+    if len(cholesky) <= SMALL:
+        inverse = np.empty_like(cholesky)
+        bundle_factor.invert(cholesky, inverse)
+        return inverse
+    lower, info = linalg.lapack.dpotri(cholesky, lower=1)
+    if info != 0:
+        raise AdjustmentError("the normal equations cannot be inverted")
+    return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
 
 
 def least_eigenvalue(cholesky: Array) -> float:
@@ -186,7 +216,7 @@ def least_eigenvalue(cholesky: Array) -> float:
     eigenvalue = np.inf
     for _ in range(4):
         vector /= np.linalg.norm(vector)
-        vector = linalg.cho_solve((cholesky, True), vector, check_finite=False)
+        vector = solve_factored(cholesky, vector)
         eigenvalue = 1.0 / max(float(np.linalg.norm(vector)), 1e-300)
     return eigenvalue
 
