@@ -1,5 +1,6 @@
 """Exterior orientations in the axes of the CRS, and the interior orientation as TOML."""
 
+import json
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -8,12 +9,14 @@ import numpy as np
 import pytest
 
 from tests.formats.blocks import FRAME, INTERIOR, oriented_block
+from uavkit.core.adjustment import Datum
 from uavkit.core.angles import rotation_from_vector
 from uavkit.core.camera import INTERIOR_PARAMETERS
 from uavkit.core.collinearity import image_coordinates
 from uavkit.core.errors import InputError
 from uavkit.core.frames import LocalFrame
 from uavkit.core.orientation import ExteriorOrientation
+from uavkit.formats.adjustment_file import write_adjustment
 from uavkit.formats.orientation_files import (
     FileOrientation,
     exterior_orientations,
@@ -21,6 +24,7 @@ from uavkit.formats.orientation_files import (
     write_exterior_orientations,
     write_interior_orientation,
 )
+from uavkit.formats.point_files import point_table, write_ply
 
 
 def as_exterior(item: FileOrientation) -> ExteriorOrientation:
@@ -151,3 +155,16 @@ def test_interior_orientation_as_toml(tmp_path: Path) -> None:
     assert content["correlations"]["x0_px"]["p1"] == pytest.approx(expected, abs=6e-5)
     assert content["undetermined"] == ["k3"]
     assert content["camera"] == "test"
+
+
+def test_a_free_network_of_a_block_with_a_frame_claims_no_place(tmp_path: Path) -> None:
+    """Two control points give the block a frame, but the result has arbitrary position and scale."""
+    georeferenced = oriented_block()
+    assert exterior_orientations(georeferenced).crs == FRAME.crs
+    free = replace(georeferenced, adjustment=replace(georeferenced.adjustment, datum=Datum.FREE_NETWORK))
+    assert exterior_orientations(free).crs is None
+    assert point_table(free).crs is None
+    write_adjustment(tmp_path / "adjustment.json", free)
+    assert json.loads((tmp_path / "adjustment.json").read_text())["crs"] is None
+    write_ply(tmp_path / "points.ply", free)
+    assert b"of arbitrary position, direction and scale" in (tmp_path / "points.ply").read_bytes()

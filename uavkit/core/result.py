@@ -6,9 +6,10 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from uavkit.core.adjustment import AdjustmentResult
+from uavkit.core.adjustment import AdjustmentResult, Datum
 from uavkit.core.arrays import Array, Indices
 from uavkit.core.block import Block
+from uavkit.core.frames import LocalFrame
 from uavkit.core.observations import Rays
 
 
@@ -93,3 +94,8 @@ class OrientedBlock:
     notes: tuple[str, ...] = ()
     """Degradations and decisions of process, in words."""
     pictures: CodePictures | None = None
+
+    @property
+    def frame(self) -> LocalFrame | None:
+        """Return where on earth the result lies: the block's frame, None for a free network, which lies nowhere."""
+        return None if self.adjustment.datum is Datum.FREE_NETWORK else self.block.frame

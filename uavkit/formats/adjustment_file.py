@@ -40,7 +40,7 @@ def adjustment_summary(oriented: OrientedBlock) -> dict[str, Any]:
         "images_oriented": len(oriented.images),
         "unoriented": oriented.unoriented,
         "datum": result.datum.value,
-        "crs": block.frame.crs if block.frame else None,
+        "crs": oriented.frame.crs if oriented.frame else None,
         "gsd_m": oriented.gsd_m,
         **_point_counts(oriented),
         "candidates": {

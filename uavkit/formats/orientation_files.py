@@ -50,7 +50,7 @@ def exterior_orientations(oriented: OrientedBlock) -> FileOrientations:
     The rotation is R_crs_from_image = R_crs_from_enu @ R_enu_from_image, with R_crs_from_enu (convergence of the
     meridian, curvature of the earth) at each projection centre; covariances are propagated to these axes.
     """
-    axes, result = survey_axes(oriented.block.frame), oriented.adjustment
+    axes, result = survey_axes(oriented.frame), oriented.adjustment
     places = axes.coordinates(result.projection_centres_m)
     rows = [
         _orientation(
@@ -67,7 +67,7 @@ def exterior_orientations(oriented: OrientedBlock) -> FileOrientations:
 
 def write_exterior_orientations(path: Path, oriented: OrientedBlock) -> None:
     """Write ``exterior_orientation.csv``, whole or not at all."""
-    contents, axes = exterior_orientations(oriented), survey_axes(oriented.block.frame)
+    contents, axes = exterior_orientations(oriented), survey_axes(oriented.frame)
     stream = io.StringIO()
     stream.write("\n".join(_head(axes, oriented.adjustment.datum.value)) + "\n")
     writer = csv.writer(stream, lineterminator="\n")

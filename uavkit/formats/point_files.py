@@ -51,7 +51,7 @@ class PointTable:
 
 def point_table(oriented: OrientedBlock) -> PointTable:
     """Return the determined points of a block in the coordinates of its CRS, local ones without a frame."""
-    axes, result = survey_axes(oriented.block.frame), oriented.adjustment
+    axes, result = survey_axes(oriented.frame), oriented.adjustment
     determined = np.all(np.isfinite(result.points_m), axis=1)
     points = result.points_m[determined]
     middle = points.mean(axis=0) if len(points) else np.zeros(3)
@@ -80,11 +80,11 @@ def write_ply(path: Path, oriented: OrientedBlock) -> None:
         records[name] = table.colours[:, column]
     records["kind"], records["rays"] = table.kinds, table.rays
     kinds = ", ".join(f"{kind.value} {kind.name.lower()}" for kind in PointKind)
-    place = f"crs {table.crs}, heights above the ellipsoid" if table.crs else "local coordinates: east, north, up"
+    place = f"crs {table.crs}, heights above the ellipsoid" if table.crs else "local coordinates"
     head = [
         "ply",
         "format binary_little_endian 1.0",
-        f"comment {place}; metres",
+        f"comment {place}; {'metres' if table.crs else 'of arbitrary position, direction and scale'}",
         f"comment kind: {kinds}",
         f"element vertex {len(records)}",
         *(f"property {_PLY_NAMES[str(_PLY_RECORD[name].str)]} {name}" for name in _PLY_RECORD.names or ()),

@@ -232,7 +232,7 @@ def _in_gsd(value: float, note: str) -> str:
 
 
 def _frame_text(result: OrientedBlock) -> str:
-    frame = result.block.frame
+    frame = result.frame
     if frame is None:
         return "Local coordinates; the place on earth is not known."
     return (
