@@ -113,7 +113,8 @@ def test_object_points_lie_on_the_ground(oriented: OrientedBlock) -> None:
     assert good.sum() > 150
     assert 0.5 < 1.4826 * np.median(np.abs(height_error / sigma)) < 2.0
     rays = np.bincount(oriented.rays.point_index[result.ray_used], minlength=len(good))[good]
-    assert np.mean(rays >= 3) > 0.6  # tie point matching finds points in all stills that see them
+    # tie point matching finds points in all stills that see them; those at the border of the block are in two only
+    assert np.mean(rays >= 3) > 0.5
     assert np.mean(oriented.point_kinds[good] == PointKind.TIE) > 0.5
 
 
