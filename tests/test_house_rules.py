@@ -4,7 +4,6 @@ import ast
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -114,14 +113,20 @@ def test_test_files_have_names_of_their_own() -> None:
     assert sorted(names) == sorted(set(names))
 
 
+def processor_time_s() -> float:
+    """Return what all finished child processes have used so far."""
+    used = os.times()
+    return used.children_user + used.children_system
+
+
 def test_help_answers_at_once() -> None:
-    """The quickest of several runs, for the machine may be busy with something else."""
+    """The processor's time, the least of several runs: the machine may be busy with something else."""
     times_s = []
     for _ in range(7):
-        start = time.perf_counter()
+        start = processor_time_s()
         assert run(sys.executable, "-m", "uavkit.cli", "--help").returncode == 0
-        times_s.append(time.perf_counter() - start)
-    assert min(times_s) < SLOWEST_HELP_S
+        times_s.append(processor_time_s() - start)
+    assert 0.0 < min(times_s) < SLOWEST_HELP_S
 
 
 def test_help_imports_nothing_heavy() -> None:
