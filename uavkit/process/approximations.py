@@ -276,7 +276,7 @@ def intersect_linearly(point: Indices, origins: Array, directions: Array, count:
     """
 
     def total(values: Array) -> Array:
-        return np.bincount(point, values, count)
+        return np.asarray(np.bincount(point, values, count), dtype=np.float64)
 
     x, y, z = directions.T
     projectors = [1.0 - x * x, -x * y, -x * z, 1.0 - y * y, -y * z, 1.0 - z * z]
