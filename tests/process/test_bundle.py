@@ -1,6 +1,7 @@
 """The bundle block adjustment against simulated truth."""
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from bundle_blocks import (
 from uavkit.core.adjustment import AdjustmentInput, AdjustmentOptions, AdjustmentResult, Datum
 from uavkit.core.angles import vector_from_rotation
 from uavkit.core.errors import AdjustmentError
+from uavkit.process import bundle_system
 from uavkit.process.bundle import adjust_block
 
 SMALL = Plan(strips=2, images=5, points=150, length_m=40.0, width_m=26.0)
@@ -122,6 +124,12 @@ def test_free_network_has_the_least_trace_and_seven_defects() -> None:
     assert free.redundancy == 2 * rays - 3 * points - 6 * len(block.centres_m) + 7
 
 
+def _datum_survives(block: SimulatedBlock, wrong: np.ndarray) -> bool:
+    """Tell whether more than half of the rays of each control point are right: the datum hangs on these few."""
+    rays = block.observations.rays.point_index
+    return all(np.mean(wrong[rays == p]) < 0.5 for p in range(3))
+
+
 def _moves(kind: str, seeds: range) -> tuple[np.ndarray, list[float]]:
     """Return moves of check points by wrong observations over their sigmas, and the share of wrong rays found."""
     moves, found = [], []
@@ -131,26 +139,27 @@ def _moves(kind: str, seeds: range) -> tuple[np.ndarray, list[float]]:
         observations, wrong = with_wrong_rays(block, rng, kind)
         observations, wrong_fixes = with_wrong_fixes(observations, rng)
         result = adjust_block(observations)
-        clean = adjust_block(block.observations, PLAIN)
-        sigma = np.sqrt(np.einsum("maa->ma", clean.point_covariances_m2[block.check]))
-        moves.append((result.points_m - clean.points_m)[block.check] / sigma)
         assert not np.any(result.gnss_used[wrong_fixes])
         assert np.mean(result.gnss_used[~wrong_fixes]) > 0.9
-        rays = np.bincount(observations.rays.point_index)[observations.rays.point_index]
-        error = np.linalg.norm(observations.rays.xy_px - block.observations.rays.xy_px, axis=1)
-        # Of two rays neither an error along the epipolar line nor the wrong one of them can be told.
-        telling = wrong & (error > 5.0 * 0.3) & (rays > 2)
-        found.append(float(np.mean(~result.ray_used[telling])))
+        assert result.control_used.all()
         assert 0.85 < result.sigma0 < 1.15
+        error = np.linalg.norm(observations.rays.xy_px - block.observations.rays.xy_px, axis=1)
+        found.append(float(np.mean(~result.ray_used[wrong & (error > 5.0 * 0.3)])))
+        if _datum_survives(block, wrong):
+            clean = adjust_block(block.observations, PLAIN)
+            sigma = np.sqrt(np.einsum("maa->ma", clean.point_covariances_m2[block.check]))
+            moves.append((result.points_m - clean.points_m)[block.check] / sigma)
+        # Of points of two rays none is believed where small errors are many; gross ones show in them, too.
+        assert bool(result.notes) == (kind == "one-sided")
     return np.concatenate(moves), found
 
 
 @pytest.mark.parametrize("kind", ["uniform", "one-sided"])
 def test_a_fifth_of_wrong_rays_and_a_tenth_of_wrong_fixes(kind: str) -> None:
-    """RMS over 24 check points: that of the information lost with the wrong rays is about 0.4 already."""
+    """RMS over the check points: that of the information lost with the wrong rays is about 0.3 already."""
     moves, found = _moves(kind, range(3))
     assert np.sqrt(np.nanmean(moves**2)) <= 0.7
-    assert np.mean(found) > 0.985
+    assert np.mean(found) > 0.99
 
 
 @pytest.mark.slow
@@ -158,7 +167,36 @@ def test_a_fifth_of_wrong_rays_and_a_tenth_of_wrong_fixes(kind: str) -> None:
 def test_wrong_observations_over_many_seeds(kind: str) -> None:
     moves, found = _moves(kind, range(20))
     assert np.sqrt(np.nanmean(moves**2)) <= 0.7
-    assert np.mean(found) > 0.985
+    assert np.mean(found) > 0.99
+
+
+def test_control_point_with_one_right_ray_keeps_its_place() -> None:
+    """Three of its four rays are wrong at random: the fourth and the survey agree, and the block must not bend."""
+    rng = np.random.default_rng(7)
+    block = simulate(rng)
+    observations, wrong = with_wrong_rays(block, rng, "uniform")
+    of_control = block.observations.rays.point_index == 1
+    assert np.count_nonzero(of_control & ~wrong) == 1
+    result = adjust_block(observations)
+    assert np.linalg.norm(result.points_m[1] - block.points_m[1]) < 0.05
+    assert result.control_used.all()
+    assert not np.any(result.ray_used[of_control & wrong])
+
+
+def test_image_keeps_its_points_of_two_rays_where_it_has_no_others() -> None:
+    """Amid many small errors points of two rays are left out, but not to the point that an image hangs in the air."""
+    rng = np.random.default_rng(3)
+    block = simulate(rng, replace(SMALL, points=400))
+    rays = block.observations.rays
+    # Image 0 keeps those rays whose point only one other image sees.
+    alone = np.bincount(rays.point_index)[rays.point_index] == 2
+    keep = np.flatnonzero((rays.image_index != 0) | alone)
+    assert np.count_nonzero(rays.image_index[keep] == 0) > 10
+    thin = replace(block, observations=replace(block.observations, rays=rays.where(keep)))
+    observations, _ = with_wrong_rays(thin, rng, "one-sided")
+    result = adjust_block(observations)
+    assert result.notes
+    assert np.count_nonzero(result.ray_used[observations.rays.image_index == 0]) > 5
 
 
 def test_clean_block_loses_next_to_nothing() -> None:
@@ -231,6 +269,28 @@ def test_result_is_the_same_bit_by_bit() -> None:
     np.testing.assert_array_equal(first.points_m, second.points_m)
     np.testing.assert_array_equal(first.exterior_covariances, second.exterior_covariances)
     assert first.sigma0 == second.sigma0
+
+
+def test_result_does_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    block = simulate(np.random.default_rng(10))
+    results = []
+    for threads in (1, 3):
+        with ThreadPoolExecutor(threads) as pool:
+            monkeypatch.setattr(bundle_system, "_pool", lambda process, pool=pool: pool)
+            results.append(adjust_block(block.observations))
+    np.testing.assert_array_equal(results[0].points_m, results[1].points_m)
+    np.testing.assert_array_equal(results[0].ray_redundancy, results[1].ray_redundancy)
+    assert results[0].sigma0 == results[1].sigma0
+
+
+def test_iteration_that_did_not_end_is_told() -> None:
+    block = simulate(np.random.default_rng(12), SMALL)
+    result = adjust_block(block.observations, AdjustmentOptions(robust=False, most_iterations=1))
+    assert not result.converged
+    assert "not converged after 1 steps" in result.notes[0]
+    done = adjust_block(block.observations, PLAIN)
+    assert done.converged
+    assert done.notes == ()
 
 
 def test_two_ray_point_with_a_wrong_ray_is_dropped() -> None:

@@ -116,3 +116,5 @@ class AdjustmentResult:
     """Rows of the points for which a joint covariance was asked for."""
     joint_covariance_m2: Array = field(default_factory=lambda: np.zeros((0, 0)))
     """(3 j, 3 j) covariance of all joint points together."""
+    notes: tuple[str, ...] = ()
+    """In words: doubtful points left out, an iteration that did not end."""

@@ -18,13 +18,12 @@ from uavkit.process.bundle_robust import (
     RETURNING_ROUNDS,
     CutRule,
     cut_weights,
-    lost_points,
-    reintersected,
-    revived,
+    notes_on_rejection,
     robust_start,
     same,
     tukey_solution,
     used_rays,
+    with_lost_points,
     without_unchecked,
 )
 from uavkit.process.bundle_system import (
@@ -70,8 +69,7 @@ def adjust_block(
         # Control is not judged before the block has converged with all of it at full weight.
         every = system.full_weights().control.size
         rule = CutRule(reject_above=wide, may_return=True, gross_above=wide, least_control=every)
-        state = reintersected(system, state, 1.0, lost_points(system, weights))
-        weights = revived(system, weights)
+        state, weights = with_lost_points(system, state, weights)
         weights = cut_weights(system, state, weights, precision_at(system, state, weights), rule)
     while True:
         state, iterations, converged = solve(system, state, weights, options)
@@ -88,7 +86,8 @@ def adjust_block(
             rounds = max(rounds, RETURNING_ROUNDS)
         weights = next_weights
         progress("bundle block adjustment: rejection", rounds, REJECTION_ROUNDS)
-    return _result(system, state, weights, precision, _Run(options, iterations, converged, joint_points))
+    notes = notes_on_rejection(system, state, weights, rounds) if options.robust else ()
+    return _result(system, state, weights, precision, _Run(options, iterations, converged, joint_points, notes))
 
 
 def choose_datum(observations: AdjustmentInput) -> Datum:
@@ -133,10 +132,20 @@ def solve(system: BundleSystem, state: State, weights: Weights, options: Adjustm
 class _Run:
     """What the result tells of the run."""
 
-    __slots__ = ("converged", "iterations", "joint_points", "options")
+    __slots__ = ("converged", "iterations", "joint_points", "notes", "options")
 
-    def __init__(self, options: AdjustmentOptions, iterations: int, converged: bool, joint: Indices | None) -> None:
+    def __init__(
+        self,
+        options: AdjustmentOptions,
+        iterations: int,
+        converged: bool,
+        joint: Indices | None,
+        notes: tuple[str, ...],
+    ) -> None:
         self.options, self.iterations, self.converged = options, iterations, converged
+        self.notes = notes
+        if not converged:
+            self.notes += (f"the adjustment had not converged after {iterations} steps: its results are provisional",)
         self.joint_points = np.zeros(0, dtype=np.int64) if joint is None else np.asarray(joint, dtype=np.int64)
 
 
@@ -193,5 +202,6 @@ def _result(system: BundleSystem, state: State, weights: Weights, precision: Pre
         iterations=run.iterations,
         converged=run.converged,
         joint_points=run.joint_points,
+        notes=run.notes,
         joint_covariance_m2=joint_covariance(system, state, weights, precision.factor, run.joint_points),
     )

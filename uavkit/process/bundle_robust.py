@@ -28,7 +28,7 @@ from uavkit.process.bundle_system import (
     misclosures,
     precision_at,
 )
-from uavkit.process.kernels.bundle_intersection import intersect_robustly
+from uavkit.process.kernels.bundle_intersection import intersect_robustly, refine
 from uavkit.process.robust import huber_weight, shrunk_scale, trimmed_scale, tukey_weight
 
 WeightFunction = Callable[[Array], Array]
@@ -51,12 +51,18 @@ ANCHOR = 0.5
 """Sigma of the approximate orientations at the start, as a share of what the first misclosures amount to."""
 FAR_OFF = 50.0
 """A ray rejected at more sigmas than this cannot be the good one that two wrong ones outvoted."""
+CONTAMINATED = 0.05
+"""Above this share of wrong rays, one point of two rays in ten is wrong, and half of those without a sign of it."""
+LEAST_SURE_RAYS = 10
+"""An image that would keep fewer rays keeps its doubtful points."""
 TUKEY_ROUNDS = 8
 STILL = 0.01
 """Steps whose unknowns change by less than this many of their sigmas, RMS, need no other before weights are renewed."""
 SETTLED_SHARE = 1e-3
 """Robust weights are settled where no more than this share of them still changes by 0.05."""
 HUBER_K = 1.345
+LEAST_GAIN = 1.0
+"""A control point is not moved to another place for less than this of Cauchy cost, which near misses may make up."""
 LEAST_CONTROL = 3
 """So many control points fix the datum without trust in GNSS; the cut leaves at least these, or all of fewer."""
 MOST_CONTROL_SCALE = 2.0
@@ -154,9 +160,12 @@ def _weighted(
 
 
 def lost_points(system: BundleSystem, weights: Weights) -> Flags:
-    """Return which points (m,) have less than one and a half rays' weight left."""
+    """Return which points (m,) have less than one and a half rays' weight left; of control points, less than half."""
     full = np.broadcast_to(np.asarray(weights.scales[0]) ** -2.0, weights.rays.shape)
-    share = np.bincount(system.point_of_ray, weights.rays / full, minlength=len(system.rays.start) - 1)
+    number = len(system.rays.start) - 1
+    share = np.bincount(system.point_of_ray, weights.rays / full, minlength=number).astype(np.float64)
+    if system.given.control is not None and system.uses_control:
+        share = share + np.isin(np.arange(len(share)), system.given.control.point_index[weights.control > 0.0])
     return np.asarray(share < 1.5)
 
 
@@ -177,7 +186,27 @@ def reintersected(system: BundleSystem, state: State, scale: Array | float, lost
         intersect_robustly(system.rays, state.unknowns, suspicious, of_point, first, last, points)
 
     list(in_chunks(system, work))
+    _let_control_speak(system, state, of_point, points)
     return replace(state, points=points)
+
+
+def _let_control_speak(system: BundleSystem, state: State, scales: Array, points: Array) -> None:
+    """Move control points to where their surveyed place and their rays together have the smaller Cauchy cost.
+
+    Two wrong rays may meet as well as two right ones do; the survey tells them apart, and it is one voice among them.
+    """
+    control, start = system.given.control, system.rays.start
+    if control is None or not system.uses_control:
+        return
+    for p, surveyed, sigma in zip(control.point_index, control.position_m, control.sigma_m, strict=True):
+        first, last, scale, costs = int(start[p]), int(start[p + 1]), float(scales[p]), []
+        candidates = (np.array(points[p]), np.array(surveyed, dtype=np.float64))
+        for candidate in candidates:
+            cost = refine(system.rays, state.unknowns, first, last, scale, candidate, np.empty(last - first))
+            off = float(np.sum(((candidate - surveyed) / (sigma * scale)) ** 2))
+            costs.append(cost + np.log1p(off) if np.isfinite(off) else np.inf)
+        if costs[1] < costs[0] - LEAST_GAIN:
+            points[p] = candidates[1]
 
 
 def revived(system: BundleSystem, weights: Weights) -> Weights:
@@ -188,6 +217,16 @@ def revived(system: BundleSystem, weights: Weights) -> Weights:
     full = np.broadcast_to(np.asarray(weights.scales[0]) ** -2.0, weights.rays.shape)
     lost = lost_points(system, weights)[system.point_of_ray]
     return replace(weights, rays=np.where(lost, full, weights.rays))
+
+
+def with_lost_points(system: BundleSystem, state: State, weights: Weights) -> tuple[State, Weights]:
+    """Return state and weights in which lost points have another chance; control points that are not stay in place."""
+    lost = lost_points(system, weights)
+    points = reintersected(system, state, 1.0, lost).points
+    if system.given.control is not None and system.uses_control:
+        kept = system.given.control.point_index[~lost[system.given.control.point_index]]
+        points[kept] = state.points[kept]
+    return replace(state, points=points), revived(system, weights)
 
 
 def robust_start(system: BundleSystem, state: State) -> tuple[State, Weights]:
@@ -390,15 +429,58 @@ def without_unchecked(system: BundleSystem, state: State, weights: Weights) -> W
 
     Of three rays any two may agree, and if two of them are wrong in the same way it is the good one that is rejected;
     with two left nothing shows it. Rays lost far off do not count: that two of those agree is hardly possible.
+    Where such errors are many (``is_contaminated``), a point of two rays is not believed even if it lost none, for
+    errors along the epipolar line do not show there; nor one that the rays it lost nearly outvote.
     """
     points = len(system.rays.start) - 1
     left = np.bincount(system.point_of_ray, weights.rays > 0.0, minlength=points)
     z = np.max(np.abs(misclosures(system, state).rays_px / system.rays.sigma_px), axis=1)
-    near = (weights.rays == 0.0) & ~(z > FAR_OFF)
-    unchecked = (left < 3) & (np.bincount(system.point_of_ray, near, minlength=points) > 0)
+    near = np.bincount(system.point_of_ray, (weights.rays == 0.0) & ~(z > FAR_OFF), minlength=points)
+    unchecked = (left < 3) & (near > 0)
+    if is_contaminated(system, state, weights):
+        doubtful = (left < 3) | (left < near + 2)
+        unchecked |= doubtful & ~_needed(system, weights, doubtful)
     if system.given.control is not None and system.uses_control:
         unchecked[system.given.control.point_index[weights.control > 0.0]] = False
     return replace(weights, rays=weights.rays * ~unchecked[system.point_of_ray])
+
+
+def wrong_share(system: BundleSystem, state: State, weights: Weights) -> float:
+    """Return the share of rays rejected, but not far off, in points of at least three: those whose errors show."""
+    testable = np.repeat(np.diff(system.rays.start) >= 3, np.diff(system.rays.start))
+    z = np.max(np.abs(misclosures(system, state).rays_px / system.rays.sigma_px), axis=1)
+    wrong = (weights.rays == 0.0) & (z <= FAR_OFF)
+    return float(np.mean(wrong[testable])) if np.any(testable) else 0.0
+
+
+def is_contaminated(system: BundleSystem, state: State, weights: Weights) -> bool:
+    """Tell whether so many rays are wrong by little that points of two rays cannot be believed."""
+    return wrong_share(system, state, weights) > CONTAMINATED
+
+
+def _needed(system: BundleSystem, weights: Weights, doubtful: Flags) -> Flags:
+    """Return which points (m,) are seen by images that would keep too few rays without the doubtful ones."""
+    sure = (weights.rays > 0.0) & ~doubtful[system.point_of_ray]
+    rays = np.bincount(system.rays.image, sure, minlength=len(system.given.projection_centres_m))
+    needed = np.zeros(len(doubtful), dtype=np.bool_)
+    needed[system.point_of_ray[(rays < LEAST_SURE_RAYS)[system.rays.image] & (weights.rays > 0.0)]] = True
+    return needed
+
+
+def notes_on_rejection(system: BundleSystem, state: State, weights: Weights, rounds: int) -> tuple[str, ...]:
+    """Return in words what the user should know of the rejection."""
+    notes = []
+    if is_contaminated(system, state, weights):
+        left = np.bincount(system.point_of_ray, weights.rays > 0.0, minlength=len(system.rays.start) - 1)
+        given = np.diff(system.rays.start)
+        notes.append(
+            f"{100 * wrong_share(system, state, weights):.0f} % of the rays that can be checked are rejected; "
+            f"{np.count_nonzero((given == 2) & (left == 0))} of {np.count_nonzero(given == 2)} points of two rays, "
+            "where errors may not show, are left out"
+        )
+    if rounds >= REJECTION_ROUNDS:
+        notes.append(f"the rejection of observations had not settled after {rounds} rounds")
+    return tuple(notes)
 
 
 def same(a: Weights, b: Weights) -> bool:
