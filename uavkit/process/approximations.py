@@ -344,7 +344,10 @@ def _adjust(block: GrowingBlock, rays: RayTable, sigmas: InteriorSigmas) -> RayT
         ),
     )
     options = AdjustmentOptions(datum=Datum.FREE_NETWORK, most_iterations=15, convergence=0.05, point_covariances=False)
-    result = adjust_block(observations, options)
+    try:
+        result = adjust_block(observations, options)
+    except AdjustmentError:  # a still that hangs by few points yet: the next ones will hold it, or leave it out
+        return rays
     block.interior = result.interior
     block.centres[images], block.rotations[images] = result.projection_centres_m, result.R_object_from_image
     rays = ray_table(rays.point, rays.image, rays.xy_px, block.interior)

@@ -174,7 +174,7 @@ def _first_candidates(place: Workplace) -> tuple[Candidates, list[tuple[int, int
     elif source is CandidateSource.AUTO:
         gaps = sorted({*through.weak_pairs, *_unplaced_pairs(place)})
         if gaps:
-            place.notes.append(f"{len(gaps)} gaps in the video: features bridge them")
+            place.notes.append(f"gaps in the video: {len(gaps)}; features bridge them")
             parts.append(_feature_candidates(place, gaps))
             rest = [pair for pair in pairs if pair not in gaps]
     return join(parts), rest
@@ -263,7 +263,7 @@ def _tie(
         workers=place.workers,
         progress=place.progress,
     )
-    tied = candidates
+    tied, found = candidates, len(candidates)
     for turn in (1, 2):
         with place.step("free network"):
             growing = without_weak_stills(growing, tied, marked)
@@ -280,6 +280,8 @@ def _tie(
         adjusted = _free_network(place, network, marked)
         network, calibration = calibrated(updated(network, adjusted), adjusted)
         _note_calibration(place, calibration)
+    if found > len(tied):
+        place.notes.append(f"points left out because their matching windows overlap others': {found - len(tied)}")
     return tied, network, growing.reasons
 
 
