@@ -7,21 +7,34 @@ from tests.process.made_blocks import FULL, Ground, Observed, ground_points, obs
 from uavkit.core.angles import vector_from_rotation
 from uavkit.core.arrays import Array
 from uavkit.core.camera import InteriorOrientation, InteriorSigmas
+from uavkit.core.collinearity import image_coordinates
 from uavkit.core.errors import AdjustmentError
 from uavkit.core.orientation import ExteriorOrientation
 from uavkit.core.progress import silent
 from uavkit.process.absolute import fit_similarity
 from uavkit.process.approximations import (
     GrowingBlock,
+    RayTable,
     common_points,
     intersect_linearly,
     orient_approximately,
     ray_table,
-    reprojection,
 )
 
 NOMINAL = InteriorOrientation(width_px=4000, height_px=3000, principal_distance_px=2684.0, x0_px=1999.5, y0_px=1499.5)
 SIGMAS = InteriorSigmas(principal_distance_px=40.0, x0_px=30.0, y0_px=30.0, k1=0.1, k2=0.1, k3=0.05, p1=2e-3, p2=2e-3)
+
+
+def reprojection(block: GrowingBlock, rays: RayTable) -> Array:
+    """Return observed minus projected image points (k, 2), NaN where still or point is not known."""
+    residuals = np.full((len(rays.point), 2), np.nan)
+    for image in np.flatnonzero(block.oriented).tolist():
+        rows = np.flatnonzero(rays.image == image)
+        exterior = ExteriorOrientation(
+            projection_centre_m=block.centres[image], R_object_from_image=block.rotations[image]
+        )
+        residuals[rows] = rays.xy_px[rows] - image_coordinates(block.points[rays.point[rows]], exterior, block.interior)
+    return residuals
 
 
 def _oriented(seen: Observed, images: int, points: int) -> GrowingBlock:
