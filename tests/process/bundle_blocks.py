@@ -93,6 +93,7 @@ def _marked(points: np.ndarray, rays_of_point: np.ndarray, plan: Plan) -> np.nda
     for x, y in wanted:
         distance = np.hypot(points[:, 0] - x, points[:, 1] - y) + 1e3 * (rays_of_point < 4)
         distance[chosen] = np.inf
+        distance[rays_of_point < 2] = np.inf
         chosen.append(int(np.argmin(distance)))
     return np.array(chosen)
 
