@@ -78,6 +78,8 @@ class Manifest(_Strict):
     """Settings ``section.option=value`` that differ from the defaults."""
     simulated: Literal["", "constant", "trace"] = ""
     """Flight whose conditions a simulated survey repeats, for the comparison in the report."""
+    simulated_scale: float = 1.0
+    """Size of the simulated stills against the published ones."""
 
 
 class FileStamp(_Strict):
@@ -306,7 +308,7 @@ class Project:
             return {name: str(value) for name, value in manifest.ingest.model_dump().items()}
         if stage is Stage.PROCESS:
             return dict(setting.partition("=")[::2] for setting in manifest.process)
-        return {"simulated": manifest.simulated}
+        return {"simulated": manifest.simulated, "simulated_scale": str(manifest.simulated_scale)}
 
     def _inputs(self, stage: Stage) -> dict[str, Path]:
         """Return the files that a stage reads, by names that do not change when the survey is moved."""

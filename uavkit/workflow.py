@@ -24,6 +24,7 @@ from uavkit.project import IngestOptions, Manifest, Original, Project, Stage, St
 
 SIMULATION_LABEL = "simulation.json"
 """Beside simulated stills: which flight they repeat. It holds no truth."""
+_FLIGHTS = {"constant": "constant", "trace": "trace"}
 DEMO: Mapping[str, Any] = {
     "flight": "trace",
     "scale": 0.25,
@@ -53,8 +54,8 @@ def begin_survey(project: Project, originals: Mapping[str, Path], options: Inges
     """Write the manifest of a survey, new or again; settings of process that it has are kept."""
     found: dict[Any, Original] = {role: project.original(path) for role, path in originals.items()}
     known = project.manifest.process if (project.folder / "manifest.json").is_file() else ()
-    simulated = _simulated_flight(originals["images"])
-    project.save_manifest(Manifest(originals=found, ingest=options, process=known, simulated=simulated))
+    label = _simulation_label(originals["images"])
+    project.save_manifest(Manifest(originals=found, ingest=options, process=known, **label))
 
 
 def choose_settings(project: Project, settings: Sequence[str]) -> None:
@@ -135,10 +136,14 @@ def report(project: Project, progress: Progress = silent) -> Path:
     from uavkit.report.tables import PaperComparison
 
     _require(project, Stage.PROCESS)
-    flight = project.manifest.simulated
-    comparison = PaperComparison(flight=flight) if flight else None
+    manifest = project.manifest
     with project.running(Stage.REPORT):
         result, folder = oriented_block(project), project.stage_folder(Stage.REPORT)
+        comparison = (
+            PaperComparison(flight=manifest.simulated, scale=manifest.simulated_scale, stills=len(result.block.stills))
+            if manifest.simulated
+            else None
+        )
         return write_report(result, folder, survey=project.folder.name, comparison=comparison, progress=progress)
 
 
@@ -237,11 +242,10 @@ def _simulation_options(values: Mapping[str, Any]) -> Any:
     return SimulationOptions(**typed)
 
 
-def _simulated_flight(images: Path) -> Any:
-    """Return the flight of the paper that simulated stills repeat in full, "" for all others."""
+def _simulation_label(images: Path) -> dict[str, Any]:
+    """Return the flight of the paper that simulated stills repeat and their scale; empty for all others."""
     try:
         label = json.loads((images / SIMULATION_LABEL).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return ""
-    whole = {"scale": 1.0, "strips": 3, "stations_per_strip": 11}
-    return label["flight"] if isinstance(label, dict) and whole.items() <= label.items() else ""
+        return {"simulated": _FLIGHTS[label["flight"]], "simulated_scale": float(label["scale"])}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}

@@ -126,4 +126,5 @@ def _parse(setting: str, text: str, present: Any) -> Any:
         return kind(text)
     except (ValueError, KeyError) as error:
         allowed = ", ".join(str(e.value) for e in kind) if issubclass(kind, Enum) else f"a value like {present}"
+        allowed = "true or false" if kind is bool else allowed
         raise InputError(f"--set {setting!r}: {text!r} does not fit; give {allowed}") from error

@@ -124,7 +124,8 @@ def orient_block(
             adjusted=adjusted,
         )
         result = summarise(found, stills, place.pyramids)
-    return replace(result, seconds=place.seconds, notes=tuple(place.notes), peak_memory_mb=peak_memory_mb())
+    notes = (*place.notes, *adjusted.result.notes)
+    return replace(result, seconds=place.seconds, notes=notes, peak_memory_mb=peak_memory_mb())
 
 
 def _approximate_block(place: Workplace) -> tuple[Candidates, GrowingBlock]:
