@@ -220,6 +220,12 @@ def test_marks_on_unknown_images():
         block_of(control=points(images=("IMG_1.png", "IMG_2.png")))
 
 
+def test_heights_of_control_without_a_datum_are_told():
+    silent = replace(points(), vertical=HeightDatum.UNKNOWN)
+    assert "control.csv: says not what its heights count from: taken as ellipsoidal" in told(block_of(control=silent))
+    assert "count from" not in told(block_of(control=points()))
+
+
 def test_a_mark_outside_of_its_image_is_refused():
     with pytest.raises(InputError, match=r"line 0: the mark of 'G1' at \(600, 1300\) lies outside of R000.jpg"):
         block_of(control=points(at=(600, 1300)))

@@ -8,7 +8,8 @@ import numpy as np
 
 from uavkit.core.arrays import Array
 from uavkit.core.errors import InputError, did_you_mean
-from uavkit.core.frames import LocalFrame
+from uavkit.core.frames import LocalFrame, parse_crs
+from uavkit.core.heights import HeightDatum
 from uavkit.core.points import CheckPoint, ControlPoint, SurveyedPoint
 from uavkit.core.records import StillInfo
 from uavkit.formats.control_file import FileMark, FilePoint, SurveyedPoints, to_local
@@ -57,6 +58,8 @@ def match_marks(surveyed: SurveyedPoints, infos: Sequence[StillInfo], unreadable
             f"{surveyed.source}: none of its {total} marks lies in a still of this block; line {example.line} names "
             f"{example.image!r}{did_you_mean(example.image, sizes)}. Is it the file of this flight?"
         )
+    if surveyed.vertical is HeightDatum.UNKNOWN and len(parse_crs(surveyed.crs).axis_info) < 3:
+        notes.append(f"{surveyed.source}: says not what its heights count from: taken as ellipsoidal")
     bare = [point.name for point in points if not point.marks]
     if bare:
         notes.append(f"{surveyed.source}: without any mark in the stills and not used: {', '.join(bare)}")
