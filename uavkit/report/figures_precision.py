@@ -65,6 +65,7 @@ def residual_vectors(result: OrientedBlock) -> Drawing:
     arrows = axes.quiver(
         *middle.T, *mean.T, angles="xy", scale_units="xy", scale=scale, color=colours, width=0.003, clip_on=False
     )
+    arrows.set_in_layout(False)  # arrows that leave the image must not push the labels out of the figure
     axes.plot(interior.x0_px, interior.y0_px, "+", color=INK, ms=9)
     key = round_number(arrow_px)
     axes.set_title(" ")  # keeps room for the key
