@@ -24,7 +24,6 @@ from uavkit.project import IngestOptions, Manifest, Original, Project, Stage, St
 
 SIMULATION_LABEL = "simulation.json"
 """Beside simulated stills: which flight they repeat. It holds no truth."""
-_FLIGHTS = {"constant": "constant", "trace": "trace"}
 DEMO: Mapping[str, Any] = {
     "flight": "trace",
     "scale": 0.25,
@@ -246,6 +245,7 @@ def _simulation_label(images: Path) -> dict[str, Any]:
     """Return the flight of the paper that simulated stills repeat and their scale; empty for all others."""
     try:
         label = json.loads((images / SIMULATION_LABEL).read_text(encoding="utf-8"))
-        return {"simulated": _FLIGHTS[label["flight"]], "simulated_scale": float(label["scale"])}
+        flight, scale = label["flight"], float(label["scale"])
     except (OSError, ValueError, KeyError, TypeError):
         return {}
+    return {"simulated": flight, "simulated_scale": scale} if flight in ("constant", "trace") else {}

@@ -22,6 +22,7 @@ from uavkit.process.video_points import (
     LEAST_THROUGH_VIDEO,
     VideoInput,
     candidates_through_video,
+    extend_motion,
     still_as_video,
     track_between_stills,
 )
@@ -252,3 +253,21 @@ def test_a_video_of_something_else_leads_nowhere(scene: Scene, other_scene: Scen
     found = candidates_through_video(given, _Counting(), workers=1, progress=silent)
     assert found.weak_pairs == [(0, 1)]
     assert len(found.candidates.ray_point) < LEAST_THROUGH_VIDEO
+
+
+def test_points_that_the_finder_crops_move_as_their_neighbours_do() -> None:
+    """Under one affine motion the prediction is exact, turned and scaled too, and tracked points stay as they are."""
+    rng = np.random.default_rng(5)
+    here = rng.uniform(0, 1000, (80, 2))
+    matrix, shift = np.array([[0.9, -0.3], [0.25, 1.1]]), np.array([40.0, -25.0])
+    truth = here @ matrix.T + shift
+    tracked = (here > 100).all(axis=1) & (here < 900).all(axis=1)
+    assert 10 < (~tracked).sum() < 60
+    there = np.where(tracked[:, None], truth, 0.0)
+    given = np.where(tracked[:, None, None], matrix, np.eye(2))
+    xy, extended, warps = extend_motion(here, there, tracked, given)
+    assert np.array_equal(extended, ~tracked)
+    assert np.abs(xy - truth).max() < 1e-6
+    assert np.abs(warps - matrix).max() < 1e-9
+    alone = np.arange(80) < 5
+    assert not extend_motion(here, there, alone, given)[1].any()

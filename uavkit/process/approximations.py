@@ -292,6 +292,32 @@ def intersect_linearly(point: Indices, origins: Array, directions: Array, count:
     return points, angle
 
 
+def intersect_without_worst(
+    point: Indices, origins: Array, directions: Array, count: int, *, tolerance: float, rounds: int
+) -> tuple[Array, Array, Flags]:
+    """Return points (count, 3), their angles, and which rays fit; in each round a point's worst misfit is left out.
+
+    ``tolerance`` is the distance of point and ray over the distance of the point; a ray away from its point misfits.
+    """
+    fits, misfit = np.ones(len(point), dtype=bool), np.zeros(len(point), dtype=bool)
+    points, angle = np.full((count, 3), np.nan), np.zeros(count)
+    for _ in range(rounds):
+        points, angle = intersect_linearly(point[fits], origins[fits], directions[fits], count)
+        to_point = points[point] - origins
+        depth = np.sum(to_point * directions, axis=1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            miss = np.linalg.norm(to_point - depth[:, None] * directions, axis=1) / depth
+        miss = np.where(np.isfinite(miss) & (depth > 0), miss, 1e9)
+        misfit = miss > tolerance
+        worst = np.zeros(count)
+        np.maximum.at(worst, point[fits], miss[fits])
+        drop = fits & misfit & (miss >= worst[point])
+        if not drop.any():
+            break
+        fits &= ~drop
+    return points, angle, np.asarray(fits & ~misfit)
+
+
 def _intersect(block: GrowingBlock, rays: RayTable, image: int | None = None) -> None:
     """Intersect the points of a still (or all) that two oriented stills see, leaving out rays that do not fit."""
     wanted = np.full(len(block.points), image is None)
@@ -299,26 +325,15 @@ def _intersect(block: GrowingBlock, rays: RayTable, image: int | None = None) ->
         wanted[rays.point[rays.image == image]] = True
     rows = np.flatnonzero(block.oriented[rays.image] & wanted[rays.point])
     numbers, point = np.unique(rays.point[rows], return_inverse=True)
-    directions = np.einsum("kij,kj->ki", block.rotations[rays.image[rows]], rays.directions[rows])
-    origins = block.centres[rays.image[rows]]
-    fits, bad = np.ones(len(rows), dtype=bool), np.zeros(len(rows), dtype=bool)
-    points, angle = np.full((len(numbers), 3), np.nan), np.zeros(len(numbers))
-    tolerance = RESECTION_TOLERANCE_PX / block.interior.principal_distance_px
-    for _ in range(3):
-        points, angle = intersect_linearly(point[fits], origins[fits], directions[fits], len(numbers))
-        to_point = points[point] - origins
-        depth = np.sum(to_point * directions, axis=1)
-        with np.errstate(invalid="ignore"):
-            miss = np.linalg.norm(to_point - depth[:, None] * directions, axis=1) / depth
-            bad = ~(miss < tolerance) | ~(depth > 0)
-        miss = np.where(bad, np.nan_to_num(miss, nan=1e9), 0.0)
-        worst = np.zeros(len(numbers))
-        np.maximum.at(worst, point[fits], miss[fits])
-        drop = fits & bad & (miss >= worst[point])
-        if not drop.any():
-            break
-        fits &= ~drop
-    enough = np.bincount(point[fits & ~bad], minlength=len(numbers)) >= 2
+    points, angle, fits = intersect_without_worst(
+        point,
+        block.centres[rays.image[rows]],
+        np.einsum("kij,kj->ki", block.rotations[rays.image[rows]], rays.directions[rows]),
+        len(numbers),
+        tolerance=RESECTION_TOLERANCE_PX / block.interior.principal_distance_px,
+        rounds=3,
+    )
+    enough = np.bincount(point[fits], minlength=len(numbers)) >= 2
     points[~(enough & (angle > LEAST_ANGLE_RAD))] = np.nan
     block.points[wanted] = np.nan
     block.points[numbers] = points

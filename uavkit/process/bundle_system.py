@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import TypeVar
 
@@ -586,8 +586,3 @@ def kernels_point_parts(
         mixed[i : i + 6] += by_image[a].T @ by_point[a]
         mixed[6 * n :] += by_border[a].T @ by_point[a]
     return mixed, inverse
-
-
-def with_points(state: State, points: Array) -> State:
-    """Return a state with other object points."""
-    return replace(state, points=points)

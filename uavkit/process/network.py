@@ -10,11 +10,13 @@ from uavkit.core.block import Block
 from uavkit.core.camera import InteriorOrientation, InteriorSigmas
 from uavkit.core.observations import ControlObservations, GnssObservations, Rays
 from uavkit.core.points import CheckPoint, ControlPoint
-from uavkit.process.approximations import GrowingBlock, RayTable, intersect_linearly, ray_table
+from uavkit.process.approximations import GrowingBlock, RayTable, intersect_without_worst, ray_table
 from uavkit.process.bundle import adjust_block
 from uavkit.process.candidates import Candidates
 from uavkit.process.options import AdjustmentSection
 
+MISFIT_PX = 15.0
+"""Rays farther from their point than this are left out of its approximate position; the adjustment judges them anew."""
 LEAST_RAYS = 8
 """Rays to points that other stills see too, for a still to take part in the adjustment."""
 
@@ -120,23 +122,15 @@ def without_weak_stills(growing: GrowingBlock, candidates: Candidates, marked: M
 def _robust_points(rays: RayTable, growing: GrowingBlock, count: int) -> Array:
     """Intersect points from their oriented rays, the worst ray of a point left out while it does not fit."""
     rows = np.flatnonzero(np.isfinite(growing.centres[rays.image, 0]))
-    directions = np.einsum("kij,kj->ki", growing.rotations[rays.image[rows]], rays.directions[rows])
-    origins, point = growing.centres[rays.image[rows]], rays.point[rows]
-    fits = np.ones(len(rows), dtype=bool)
-    tolerance = 15.0 / growing.interior.principal_distance_px
-    for _ in range(4):
-        points, _ = intersect_linearly(point[fits], origins[fits], directions[fits], count)
-        to_point = points[point] - origins
-        depth = np.sum(to_point * directions, axis=1)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            miss = np.linalg.norm(to_point - depth[:, None] * directions, axis=1) / np.abs(depth)
-        miss = np.where(np.isfinite(miss) & (depth > 0), miss, 1e9)
-        worst = np.zeros(count)
-        np.maximum.at(worst, point[fits], miss[fits])
-        drop = fits & (miss > tolerance) & (miss >= worst[point])
-        if not drop.any():
-            break
-        fits &= ~drop
+    point, image = rays.point[rows], rays.image[rows]
+    points, _, fits = intersect_without_worst(
+        point,
+        growing.centres[image],
+        np.einsum("kij,kj->ki", growing.rotations[image], rays.directions[rows]),
+        count,
+        tolerance=MISFIT_PX / growing.interior.principal_distance_px,
+        rounds=4,
+    )
     points[np.bincount(point[fits], minlength=count) < 2] = np.nan
     return points
 
