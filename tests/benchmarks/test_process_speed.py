@@ -1,0 +1,45 @@
+"""Time and memory of ``uavkit process`` against COLMAP on the same stills, one right after the other."""
+
+import json
+import shutil
+from typing import Any
+
+import pytest
+
+from tests.benchmarks.blocks import Case, cases, ingest, process, render
+from tests.benchmarks.rows import WORK, measured
+from tests.benchmarks.subprocesses import run_measured
+
+pytestmark = pytest.mark.slow
+
+CASES = cases("accuracy full size")
+
+
+def colmap(case: Case) -> dict[str, Any]:
+    """Run COLMAP on the stills of a case and return its row; its database and models are removed."""
+    work = WORK / "colmap" / case.name
+    result = work.with_suffix(".json")
+    arguments = ["tests.benchmarks.colmap_peer", str(render(case)), str(work), str(result)]
+    finished = run_measured(arguments, WORK / "logs" / f"COLMAP {case.name}.log")
+    shutil.rmtree(work)
+    return {"peak_mb": finished.peak_mb, **json.loads(result.read_text(encoding="utf-8"))}
+
+
+def compared(case: Case) -> dict[str, Any]:
+    """Process a case and let COLMAP do the same stills; keep what COLMAP found as a row of its own."""
+    ingest(case)
+    ours = process(case)
+    peer = measured("COLMAP full size", case.name, lambda: colmap(case))
+    return {
+        "ours_s": ours.wall_s,
+        "colmap_s": peer["total_s"],
+        "ratio": ours.wall_s / peer["total_s"],
+        "ours_peak_mb": ours.peak_mb,
+        "colmap_peak_mb": peer["peak_mb"],
+    }
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_process_against_colmap(case: Case) -> None:
+    row = measured("process speed", case.name, lambda: compared(case))
+    assert row["ours_s"] > 0
