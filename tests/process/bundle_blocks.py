@@ -38,6 +38,13 @@ class Plan:
     control: int = 3
     self_calibration: bool = True
     lever_arm_m: tuple[float, float, float] = (0.1, -0.2, 0.3)
+    relief: float = 1.0
+    """Factor to the heights of the ground; 0 is flat."""
+    tilt_rad: float = 0.05
+    """Standard deviation of the nadir distance in each axis."""
+    height_sigma_m: float = 0.5
+    """Standard deviation of the flying height."""
+    interior_sigmas: InteriorSigmas = INTERIOR_SIGMAS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +62,7 @@ class SimulatedBlock:
 
 def relief_m(x: np.ndarray, y: np.ndarray, plan: Plan) -> np.ndarray:
     """Return the height of the ground: an embankment along the block with a wave on it."""
-    return 6.0 * np.exp(-(((y - plan.width_m / 2) / 8.0) ** 2)) + np.sin(x / 5.0)
+    return plan.relief * (6.0 * np.exp(-(((y - plan.width_m / 2) / 8.0) ** 2)) + np.sin(x / 5.0))
 
 
 def _orientations(rng: np.random.Generator, plan: Plan) -> tuple[np.ndarray, np.ndarray]:
@@ -64,9 +71,9 @@ def _orientations(rng: np.random.Generator, plan: Plan) -> tuple[np.ndarray, np.
         for image in range(plan.images):
             x = plan.margin_m[0] + (plan.length_m - 2 * plan.margin_m[0]) * image / max(plan.images - 1, 1)
             y = plan.margin_m[1] + (plan.width_m - 2 * plan.margin_m[1]) * strip / max(plan.strips - 1, 1)
-            centres.append(np.array([x, y, plan.height_m]) + rng.normal(0, [0.3, 0.3, 0.5]))
+            centres.append(np.array([x, y, plan.height_m]) + rng.normal(0, [0.3, 0.3, plan.height_sigma_m]))
             kappa = np.pi / 2 + (strip % 2) * np.pi + rng.normal(0, 0.05)
-            rotations.append(rotation_from_omega_phi_kappa(*rng.normal(0, 0.05, 2), kappa))
+            rotations.append(rotation_from_omega_phi_kappa(*rng.normal(0, plan.tilt_rad, 2), kappa))
     return np.array(centres), np.array(rotations)
 
 
@@ -113,7 +120,7 @@ def simulate(rng: np.random.Generator, plan: Plan | None = None, start_error: fl
     points, row, n = points[order], new[row], len(centres)
     shift = np.array([[1.5, -2.0, 3.0]]) if plan.control else rng.normal(0, SHIFT_SIGMA_M)[None]
     antenna = centres + rotations @ np.array(plan.lever_arm_m) + shift
-    sigmas = INTERIOR_SIGMAS if plan.self_calibration else InteriorSigmas()
+    sigmas = plan.interior_sigmas if plan.self_calibration else InteriorSigmas()
     prior = TRUE_INTERIOR.with_parameters(TRUE_INTERIOR.parameters() + rng.normal(0, 1, 10) * sigmas.values())
     control = ControlObservations(
         point_index=np.arange(plan.control),

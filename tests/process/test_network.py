@@ -172,7 +172,20 @@ def test_surveyed_check_coordinates_are_held_back() -> None:
     np.testing.assert_array_equal(first.result.points_m, second.result.points_m)
     np.testing.assert_array_equal(first.result.projection_centres_m, second.result.projection_centres_m)
     assert first.result.sigma0 == second.result.sigma0
-    assert first.points[first.result.joint_points].tolist() == [network.marks_from + 3, network.marks_from + 4]
+    joint = first.points[first.result.joint_points]
+    assert joint[joint >= network.marks_from].tolist() == [network.marks_from + 3, network.marks_from + 4]
+
+
+def test_joint_covariance_is_asked_for_points_all_over_the_block() -> None:
+    block = _block()
+    network, marked = _network(block)
+    for datum in (None, Datum.FREE_NETWORK):
+        adjusted = adjust_network(network, block, marked, AdjustmentSection(), datum)
+        rows = adjusted.result.joint_points
+        spread = adjusted.result.points_m[rows[adjusted.points[rows] < network.marks_from]]
+        every = adjusted.result.points_m[adjusted.points < network.marks_from]
+        assert 8 <= len(spread) <= 25
+        assert np.all(np.ptp(spread[:, :2], axis=0) > 0.6 * np.ptp(every[:, :2], axis=0))
 
 
 def test_surveyed_control_coordinates_are_used() -> None:

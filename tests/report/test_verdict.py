@@ -95,6 +95,22 @@ def test_nadir_stills_over_flat_ground_invite_doming(result: OrientedBlock) -> N
     assert words not in said(adjusted(flat, projection_centres_m=two_heights))
 
 
+def test_a_bow_that_the_observations_leave_open_is_told(result: OrientedBlock) -> None:
+    """The joint covariance of a bow of known sigma: that sigma is said, in ground pixels, as a limit from two on."""
+    rows = np.arange(0, len(result.adjustment.points_m), 30)
+    points = result.adjustment.points_m[rows]
+    axes = np.linalg.svd(result.adjustment.R_object_from_image[:, :, 2].mean(axis=0)[None])[2]
+    place = points @ axes[1:].T
+    place -= np.median(place, axis=0)
+    edge = np.percentile(np.linalg.norm(place, axis=1), 95.0)
+    shape = (np.sum((place / edge) ** 2, axis=1)[:, None] * axes[0]).ravel()
+    for pixels, weight, words in ((4.0, Weight.LIMIT, "badly determined"), (0.5, Weight.GOOD, "centre to its edge")):
+        sigma_m = pixels * result.gsd_m
+        bent = adjusted(result, joint_points=rows, joint_covariance_m2=sigma_m**2 * np.outer(shape, shape))
+        assert words in said(bent, weight)
+        assert f"({pixels:.1f} GSD)" in said(bent, weight)
+
+
 def test_strips_that_hang_by_few_points(make_result: MakeResult) -> None:
     result = make_result(strips=3, images_per_strip=6, points=900)
     words = "share fewer than 10 points"

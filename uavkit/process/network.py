@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uavkit.core.adjustment import AdjustmentInput, AdjustmentOptions, AdjustmentResult, Datum
-from uavkit.core.arrays import Array, Indices
+from uavkit.core.arrays import Array, Flags, Indices
 from uavkit.core.block import Block
 from uavkit.core.camera import InteriorOrientation, InteriorSigmas
 from uavkit.core.observations import ControlObservations, GnssObservations, Rays
@@ -179,9 +179,29 @@ def adjust_network(
         control=None if free else _control(marked, points, network.marks_from),
     )
     settings = AdjustmentOptions(datum=datum, tukey_c=options.tukey_c, reject_above=options.reject_above)
-    check = np.flatnonzero(points >= network.marks_from + marked.control)
-    result = adjust_block(observations, settings, joint_points=None if free else check)
+    joint = _spread_points(observations, points < network.marks_from)
+    if not free:
+        joint = np.union1d(joint, np.flatnonzero(points >= network.marks_from + marked.control))
+    result = adjust_block(observations, settings, joint_points=joint)
     return AdjustedNetwork(result=result, images=images, points=points, rays=rays, ray_rows=rows)
+
+
+def _spread_points(given: AdjustmentInput, may_serve: Flags) -> Indices:
+    """Return the rows of up to 25 points spread over the block: their joint covariance tells how well its shape is
+    determined. They are the nearest, of those with most rays, to the middles of 5 x 5 cells seen from the cameras."""
+    rays = np.bincount(given.rays.point_index, minlength=len(given.points_m))
+    rows = np.flatnonzero(may_serve & (rays >= 3))
+    if len(rows) == 0:
+        return rows
+    view = np.linalg.svd(given.R_object_from_image[:, :, 2].mean(axis=0)[None])[2]
+    plane = given.points_m[rows] @ view[1:].T
+    least, most = np.quantile(plane, [0.03, 0.97], axis=0)
+    cell = np.clip((plane - least) / np.maximum(most - least, 1e-12) * 5.0, 0.0, 4.999)
+    number = np.floor(cell).astype(np.int64) @ np.array([5, 1])
+    off = np.linalg.norm(cell - np.floor(cell) - 0.5, axis=1) - np.minimum(rays[rows], 6)
+    order = np.lexsort((off, number))
+    _, first = np.unique(number[order], return_index=True)
+    return np.sort(rows[order[first]])
 
 
 def interior_sigmas(block: Block) -> InteriorSigmas:

@@ -251,6 +251,29 @@ def check_point_doming(result: OrientedBlock) -> DomingTest:
     return doming_test(surveyed_distances_m(result, result.check), z, s, edge)
 
 
+def predicted_bow_sigma_m(result: OrientedBlock) -> float:
+    """Return the predicted sigma of a bow of the heights from the centre of the block to its edge; NaN if not known.
+
+    The bow is d in the plane with a bow, a + b x + c y + d (r / edge)^2, fitted by least squares to the heights of the
+    points whose joint covariance the adjustment gave: its sigma follows from that covariance. It says how well the
+    observations determine the curvature of the block, whether or not anything checks it.
+    """
+    adjusted = result.adjustment
+    good = np.isfinite(adjusted.points_m[adjusted.joint_points, 0])
+    rows = adjusted.joint_points[good]
+    if len(rows) < 8:
+        return float("nan")
+    axes = np.linalg.svd(adjusted.R_object_from_image[:, :, 2].mean(axis=0)[None])[2]
+    place = adjusted.points_m[rows] @ axes[1:].T
+    place = place - np.median(place, axis=0)
+    edge = float(np.percentile(np.linalg.norm(place, axis=1), 95.0))
+    design = np.column_stack([np.ones(len(rows)), place / edge, np.sum((place / edge) ** 2, axis=1)])
+    bow = np.linalg.pinv(design)[3]
+    joint = adjusted.joint_covariance_m2.reshape(len(good), 3, len(good), 3)[good][:, :, good]
+    heights = np.einsum("iajb,a,b->ij", joint, axes[0], axes[0])
+    return float(np.sqrt(max(bow @ heights @ bow, 0.0)))
+
+
 def interior_correlation(result: OrientedBlock) -> tuple[tuple[str, ...], Array]:
     """Return the names of the free interior parameters and their correlation matrix."""
     covariance = result.adjustment.interior_covariance

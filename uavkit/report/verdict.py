@@ -18,6 +18,7 @@ from uavkit.report.measures import (
     interior_correlation,
     interior_prior_sigmas,
     length_unit,
+    predicted_bow_sigma_m,
     prediction_test,
     rays_of_points,
     strip_ties,
@@ -28,6 +29,8 @@ from uavkit.report.measures import (
 PRACTICAL_TOLERANCE = 0.05
 """A sigma0 within 5 % of 1 agrees for all practical purposes, however significant the difference may be."""
 FEW_TIES = 10
+WEAK_BOW_GSD = 2.0
+"""Predicted sigma of a bow from which the heights count as badly determined: points are good to about half a pixel."""
 FAR_FROM_PRIOR = 4.0
 """Sigmas between a parameter of the interior orientation and its a priori value."""
 
@@ -232,7 +235,18 @@ def _doming(result: OrientedBlock) -> Iterator[Remark]:
             yield limit(f"{text}: the block is domed.")
         else:
             yield good(f"{text}: no doming found.")
-    if _invites_doming(result):
+    sigma = predicted_bow_sigma_m(result)
+    if np.isfinite(sigma):
+        size = f"{1e3 * sigma:.1f} {unit.thousandth} ({sigma / result.gsd_m:.1f} GSD)"
+        if sigma > WEAK_BOW_GSD * result.gsd_m:
+            yield limit(
+                f"The heights are badly determined: a bow from the centre of the block to its edge has a predicted "
+                f"sigma of {size}, and no residual would show it. Control in the middle and at the edges, some oblique "
+                f"stills or a second height would fix it."
+            )
+        else:
+            yield good(f"A bow of the block from its centre to its edge has a predicted sigma of {size}.")
+    elif _invites_doming(result):
         yield watch(
             "All stills look straight down from one height over flat ground: such a block invites doming. Control in "
             "the middle and at the edges, a few oblique stills or a second height would prevent it."
