@@ -7,7 +7,7 @@ process are run anew for each row.
 import shutil
 import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,8 @@ class Case:
     """Of ``uavkit process --set``."""
     positions: str = "positions.kml"
     """File of the flight that ``uavkit ingest`` is given."""
-    bars: Mapping[str, Any] = field(default_factory=dict)
+    without: tuple[str, ...] = ()
+    """Originals that ``uavkit ingest`` is not given, by the name of the option."""
 
     @property
     def flight(self) -> Path:
@@ -63,6 +64,7 @@ def _cases(benchmark: str, table: Mapping[str, Any]) -> Iterator[Case]:
             simulate={**table.get("simulate", {}), **varied},
             settings=tuple(table.get("settings", ())),
             positions=table.get("positions", "positions.kml"),
+            without=tuple(table.get("without", ())),
         )
 
 
@@ -102,7 +104,8 @@ def ingest(case: Case) -> Finished:
         "control-points": "control_points.csv",
         "check-points": "check_points.csv",
     }
-    given = {role: flight / name for role, name in originals.items() if (flight / name).exists()}
+    known = {role: flight / name for role, name in originals.items() if role not in case.without}
+    given = {role: path for role, path in known.items() if role != "video" or path.is_file()}
     words = [word for role, path in given.items() for word in (f"--{role}", str(path))]
     return run_measured(["uavkit.cli", "ingest", str(survey), *words], _log(case, "ingest"))
 

@@ -20,6 +20,7 @@ import pycolmap
 from tests.benchmarks.subprocesses import THREADS
 from uavkit.core.arrays import Array
 from uavkit.formats.control_file import SurveyedPoints, read_surveyed_points
+from uavkit.process.absolute import fit_similarity
 from uavkit.simulate.site import site_frame
 
 CENTRE_FROM_CORNER_PX = 0.5
@@ -111,23 +112,13 @@ def _projected(image: Any, camera: Any, place: Array) -> Array:
     return np.asarray(camera.img_from_cam(image.cam_from_world() * place, False)).ravel()
 
 
-def similarity(model: Array, ground: Array) -> tuple[float, Array, Array]:
-    """Return scale, rotation (3, 3) and shift (3,) that bring points (n, 3) nearest to others (Umeyama 1991)."""
-    from_middle, to_middle = model - model.mean(axis=0), ground - ground.mean(axis=0)
-    u, s, v = np.linalg.svd(to_middle.T @ from_middle)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
-    rotation = (u * sign) @ v
-    scale = float((s * sign).sum() / np.sum(from_middle**2))
-    return scale, rotation, ground.mean(axis=0) - scale * rotation @ model.mean(axis=0)
-
-
 def judged(model: pycolmap.Reconstruction, flight: Path) -> dict[str, Any]:
     """Return the differences of the check points from their surveyed coordinates, and what else tells the quality."""
     control = read_surveyed_points(flight / "control_points.csv")
     check = read_surveyed_points(flight / "check_points.csv")
-    scale, rotation, shift = similarity(*intersected(model, control))
+    ground_from_model = fit_similarity(*intersected(model, control))
     places, ground = intersected(model, check)
-    difference = scale * places @ rotation.T + shift - ground
+    difference = ground_from_model.apply(places) - ground
     return {
         "stills_oriented": model.num_reg_images(),
         "points": model.num_points3D(),

@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from uavkit.core.arrays import Array, Indices
+from uavkit.core.arrays import Array, Flags, Indices
 from uavkit.core.result import OrientedBlock
 from uavkit.report.measures import determined_points, differences_m, rays_of_points, strip_ties
 from uavkit.simulate.camera import SimulatedCamera, SimulatedView
+from uavkit.simulate.kernels import CELL_M
 from uavkit.simulate.options import SimulationOptions
 from uavkit.simulate.survey import make_scene
-from uavkit.simulate.world import CELL_M, SHAPE, World, enu_from_site
+from uavkit.simulate.world import World, enu_from_site
 
 CHI_SQUARE_PROBABILITY = 0.999
 GROUND_CELL_M = 1.0
@@ -33,26 +34,29 @@ def evaluated(result: OrientedBlock, truth: Mapping[str, Any]) -> dict[str, Any]
         "video_share": result.video_share,
         "sigma0": result.adjustment.sigma0,
         "step_s": {step: round(seconds, 1) for step, seconds in result.seconds.items()},
-        **check_point_errors(result, truth),
+        "check_points_expected": len(truth["check_points"]),
+        **check_point_errors(
+            differences_m(result.check), result.check_covariance_m2, surveyed_minus_true_m(result, truth)
+        ),
         **yielded(result, true_world(truth), views),
         "fewest_ties_of_neighbouring_strips": fewest_ties(strip_ties(result)[1]),
     }
 
 
-def check_point_errors(result: OrientedBlock, truth: Mapping[str, Any]) -> dict[str, Any]:
-    """Return root mean square errors and their prediction, XY of both axes together, and chi-square of all of them."""
-    surveyed, covariance = differences_m(result.check), result.check_covariance_m2
-    variance = np.diag(covariance).reshape(-1, 3)
-    weighted = float(surveyed.ravel() @ np.linalg.solve(covariance, surveyed.ravel()))
+def check_point_errors(difference_m: Array, covariance_m2: Array, surveyed_minus_true_m: Array) -> dict[str, Any]:
+    """Return root mean square errors and their prediction, XY of both axes together, and chi-square of all of them.
+
+    Differences (n, 3) are block minus survey, with their joint covariance (3 n, 3 n).
+    """
+    variance = np.diag(covariance_m2).reshape(-1, 3)
     return {
-        "check_points": len(surveyed),
-        "check_points_expected": len(truth["check_points"]),
-        **_root_mean_squares("rmse", surveyed**2),
+        "check_points": len(difference_m),
+        **_root_mean_squares("rmse", difference_m**2),
         **_root_mean_squares("rmse_predicted", variance),
-        **_root_mean_squares("rmse_true", (surveyed + surveyed_minus_true_m(result, truth)) ** 2),
-        "chi_square": weighted,
-        "chi_square_freedom": surveyed.size,
-        "chi_square_bound": chi_square_bound(surveyed.size),
+        **_root_mean_squares("rmse_true", (difference_m + surveyed_minus_true_m) ** 2),
+        "chi_square": float(difference_m.ravel() @ np.linalg.solve(covariance_m2, difference_m.ravel())),
+        "chi_square_freedom": difference_m.size,
+        "chi_square_bound": chi_square_bound(difference_m.size),
     }
 
 
@@ -142,7 +146,7 @@ def _in_site_frame(result: OrientedBlock, points_m: Array) -> Array:
 
 def ground_cells(world: World) -> Array:
     """Return the middle of each ground cell of the site, on the true surface, shape (n, 3) in east, north, up."""
-    half = [0.5 * (nodes - 1) * CELL_M for nodes in SHAPE]
+    half = [0.5 * (nodes - 1) * CELL_M for nodes in world.ground.heights_m.shape]
     across, along = (np.arange(np.ceil(-h) + 0.5 * GROUND_CELL_M, h, GROUND_CELL_M) for h in half)
     grid = np.stack(np.meshgrid(along, across), axis=-1).reshape(-1, 2)
     enu = np.column_stack([grid, np.zeros(len(grid))]) @ enu_from_site().T
@@ -150,9 +154,9 @@ def ground_cells(world: World) -> Array:
     return enu
 
 
-def holds_a_point(cells_m: Array, points_m: Array) -> Array:
+def holds_a_point(cells_m: Array, points_m: Array) -> Flags:
     """Tell which ground cells, given by their middles (n, 3), hold one of the points (m, 3)."""
-    return np.isin(_cell_numbers(cells_m), _cell_numbers(points_m))
+    return np.asarray(np.isin(_cell_numbers(cells_m), _cell_numbers(points_m)))
 
 
 def _cell_numbers(points_m: Array) -> Indices:

@@ -1,14 +1,17 @@
+# ruff: noqa: T201 (it prints what it removed)
 """Rows of benchmarks: measured once, kept in ``results/rows.jsonl``, and not measured again until removed.
 
-A run that was stopped goes on where it stopped. Each row names the commit and the day on which it was measured;
-``UAVKIT_BENCH_FRESH=1`` measures all rows anew.
+A run that was stopped goes on where it stopped. Each row names the commit and the day on which it was measured.
+``UAVKIT_BENCH_FRESH`` names benchmarks, separated by commas, whose rows are measured anew; ``all`` means all.
+``python -m tests.benchmarks.rows BENCHMARK ...`` removes the rows of benchmarks, so that the next run measures them.
 """
 
 import json
 import os
 import platform
 import subprocess
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -35,13 +38,27 @@ def measured(benchmark: str, case: str, measure: Callable[[], Mapping[str, Any]]
     The measured values are plain numbers, texts and lists, with the unit in each name.
     """
     known = kept_rows(path).get((benchmark, case))
-    if known is not None and not os.environ.get("UAVKIT_BENCH_FRESH"):
+    if known is not None and not _fresh(benchmark):
         return known
     row = {"benchmark": benchmark, "case": case, **_circumstances(), **measure()}
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(row, ensure_ascii=False) + "\n")
     return row
+
+
+def _fresh(benchmark: str) -> bool:
+    """Tell whether the rows of a benchmark are to be measured anew."""
+    named = {name.strip() for name in os.environ.get("UAVKIT_BENCH_FRESH", "").split(",")}
+    return bool(named & {"all", "1", benchmark})
+
+
+def forget(benchmarks: Sequence[str], path: Path = ROWS) -> int:
+    """Remove the rows of benchmarks and return how many these were."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    kept = [line for line in lines if line.strip() and json.loads(line)["benchmark"] not in benchmarks]
+    path.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+    return len(lines) - len(kept)
 
 
 def _circumstances() -> Row:
@@ -57,3 +74,7 @@ def _circumstances() -> Row:
         "load": round(os.getloadavg()[0], 1),
         "python": platform.python_version(),
     }
+
+
+if __name__ == "__main__":
+    print(f"removed {forget(sys.argv[1:])} rows")

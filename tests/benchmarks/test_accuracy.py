@@ -11,7 +11,16 @@ from tests.benchmarks.rows import measured
 
 pytestmark = pytest.mark.slow
 
-BENCHMARKS = ("accuracy full size", "accuracy full size by features")
+BENCHMARKS = (
+    "accuracy full size",
+    "accuracy full size by features",
+    "accuracy half scale",
+    "terrains half scale",
+    "textures half scale",
+    "textures half scale by features",
+    "brightness half scale",
+    "accuracy RTK",
+)
 CASES = [case for benchmark in BENCHMARKS for case in cases(benchmark)]
 
 
