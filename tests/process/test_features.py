@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from tests.process.made_blocks import SMALL, Ground, MadeStills, carpet, stations, still_of
 from uavkit.core.angles import rotation_from_omega_phi_kappa
@@ -31,11 +32,15 @@ from uavkit.process.pictures import PictureStore, PyramidStore
 OPTIONS = CandidateOptions(feature_width_px=800, features=800)
 
 
+def in_bytes(unit: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return np.minimum(np.rint(512.0 * unit), 255).astype(np.uint8)
+
+
 def _features(xy: Array, rng: np.random.Generator, angle: float = 0.0, size: float = 4.0) -> Features:
     descriptors = np.abs(rng.normal(0, 1, (len(xy), 128))).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1)[:, None]
     return Features(
-        xy_px=xy, size_px=np.full(len(xy), size), angle_rad=np.full(len(xy), angle), descriptors=descriptors
+        xy_px=xy, size_px=np.full(len(xy), size), angle_rad=np.full(len(xy), angle), descriptors=in_bytes(descriptors)
     )
 
 
@@ -117,7 +122,7 @@ def test_no_links_no_tasks() -> None:
 
 def _brute_force(first: Features, second: Features, allowed: np.ndarray) -> set[tuple[int, int]]:
     """Mutually most alike among the allowed pairs, standing out from the second best from one side at least."""
-    likeness = np.where(allowed, first.descriptors @ second.descriptors.T, -2.0)
+    likeness = np.where(allowed, first.unit_descriptors @ second.unit_descriptors.T, -2.0)
     result = set()
 
     def ratio(values: np.ndarray) -> float:
@@ -144,12 +149,12 @@ def _pair_of_sets(rng: np.random.Generator, count: int) -> tuple[Features, Featu
     points = np.column_stack([rng.uniform(-4, 8, (count, 2)), rng.uniform(-1, 1, count)])
     first = _features(image_coordinates(points, here, SMALL), rng)
     noise = rng.normal(0, 0.02, (count, 128)).astype(np.float32)
-    descriptors = np.abs(first.descriptors + noise)
+    descriptors = np.abs(first.unit_descriptors + noise)
     descriptors[: count // 4] = descriptors[rng.permutation(count // 4)]
     descriptors /= np.linalg.norm(descriptors, axis=1)[:, None]
     second = Features(
         xy_px=image_coordinates(points, there, SMALL), size_px=first.size_px, angle_rad=first.angle_rad,
-        descriptors=descriptors,
+        descriptors=in_bytes(descriptors),
     )  # fmt: skip
     # x_there^T E x_here = 0 with E = [t]x R in vision axes (y down, z forward)
     flip = np.diag([1.0, -1.0, -1.0])

@@ -21,6 +21,7 @@ from uavkit.process.pictures import PictureStore
 
 LOWE_RATIO = 0.8
 """Nearest over second nearest descriptor distance (Lowe 2004)."""
+_UNIT_IN_BYTES = 512.0
 EPIPOLAR_TOLERANCE_PX = 6.0
 """Distance from the epipolar line that an unknown lens distortion may cause."""
 LEAST_MATCHES = 15
@@ -44,8 +45,14 @@ class Features:
     """(n,)."""
     angle_rad: Array
     """(n,) direction of the feature, clockwise from the column axis."""
-    descriptors: NDArray[np.float32]
-    """(n, 128) of unit length, square roots of SIFT's histograms (Arandjelovic and Zisserman 2012)."""
+    descriptors: NDArray[np.uint8]
+    """(n, 128) square roots of SIFT's normalised histograms (Arandjelovic and Zisserman 2012) with length 512."""
+
+    @property
+    def unit_descriptors(self) -> Descriptors:
+        """Return the descriptors with length 1; kept in bytes, those of all stills take a quarter of the memory."""
+        values = self.descriptors.astype(np.float32)
+        return np.asarray(values / np.maximum(np.linalg.norm(values, axis=1), 1.0)[:, None])
 
     def strongest(self, most: int) -> "Features":
         """Return the first so many features: they stand in the order of their strength."""
@@ -73,15 +80,15 @@ def detect_features(grey: Image, options: CandidateOptions) -> Features:
             xy_px=np.zeros((0, 2)),
             size_px=np.zeros(0),
             angle_rad=np.zeros(0),
-            descriptors=np.zeros((0, 128), np.float32),
+            descriptors=np.zeros((0, 128), np.uint8),
         )
     keypoints, raw = detector.compute(small, keypoints)
-    descriptors = np.sqrt(raw / np.maximum(raw.sum(axis=1, keepdims=True), 1e-9)).astype(np.float32)
+    roots = np.sqrt(raw / np.maximum(raw.sum(axis=1, keepdims=True), 1e-9))
     return Features(
         xy_px=(np.array([k.pt for k in keypoints]) + 0.5) * scale - 0.5,
         size_px=np.array([k.size for k in keypoints]) * float(scale.mean()),
         angle_rad=np.radians([k.angle for k in keypoints]),
-        descriptors=descriptors,
+        descriptors=np.minimum(np.rint(_UNIT_IN_BYTES * roots), 255).astype(np.uint8),
     )
 
 
@@ -127,7 +134,7 @@ def match_descriptors(first: Features, second: Features) -> Indices:
     """Return rows (n, 2) of mutually nearest descriptors that pass the ratio test in one direction or the other."""
     if len(first.xy_px) < 2 or len(second.xy_px) < 2:
         return np.zeros((0, 2), dtype=np.int64)
-    likeness = first.descriptors @ second.descriptors.T
+    likeness = first.unit_descriptors @ second.unit_descriptors.T
     return _mutual(*_two_best(likeness), *_two_best(likeness.T))
 
 
@@ -199,8 +206,8 @@ def match_guided(
     best = [np.full((len(f.xy_px), 2), UNLIKE, dtype=np.float32) for f in (first, second)]
     index = [np.zeros(len(f.xy_px), dtype=np.int64) for f in (first, second)]
     best_allowed(
-        first.descriptors,
-        second.descriptors,
+        first.unit_descriptors,
+        second.unit_descriptors,
         predicted.astype(np.float32),
         lines.astype(np.float32),
         second.xy_px.astype(np.float32),
@@ -252,7 +259,7 @@ def match_features(
     used = sorted({index for pair in pairs for index in pair})
     found = dict(zip(used, _in_order(detect, used, workers, progress, "features"), strict=True))
     nothing = Features(
-        xy_px=np.zeros((0, 2)), size_px=np.zeros(0), angle_rad=np.zeros(0), descriptors=np.zeros((0, 128), np.float32)
+        xy_px=np.zeros((0, 2)), size_px=np.zeros(0), angle_rad=np.zeros(0), descriptors=np.zeros((0, 128), np.uint8)
     )
     features = [found.get(index, nothing) for index in range(len(store))]
 
@@ -269,7 +276,7 @@ def _cached_features(store: PictureStore, index: int, options: CandidateOptions,
         found = detect_features(store.grey(index), options)
         return {"xy": found.xy_px, "size": found.size_px, "angle": found.angle_rad, "descriptors": found.descriptors}
 
-    key = content_hash(["features 2", store.fingerprint(index), str((options.feature_width_px, options.features))])
+    key = content_hash(["features 3", store.fingerprint(index), str((options.feature_width_px, options.features))])
     kept = cache.arrays("features", key, compute)
     return Features(xy_px=kept["xy"], size_px=kept["size"], angle_rad=kept["angle"], descriptors=kept["descriptors"])
 
