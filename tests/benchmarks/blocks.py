@@ -55,17 +55,25 @@ def cases(benchmark: str, path: Path = CASES) -> list[Case]:
 
 
 def _cases(benchmark: str, table: Mapping[str, Any]) -> Iterator[Case]:
-    vary: dict[str, list[Any]] = table["vary"]
-    for values in product(*vary.values()):
-        varied = dict(zip(vary, values, strict=True))
+    for name, varied in _variations(table):
         yield Case(
             benchmark=benchmark,
-            name=", ".join(str(value) if isinstance(value, str) else f"{key} {value}" for key, value in varied.items()),
+            name=name,
             simulate={**table.get("simulate", {}), **varied},
             settings=tuple(table.get("settings", ())),
             positions=table.get("positions", "positions.kml"),
             without=tuple(table.get("without", ())),
         )
+
+
+def _variations(table: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Return name and options of each case of a table: those listed by name, and all combinations of what varies."""
+    yield from table.get("named", {}).items()
+    vary: Mapping[str, list[Any]] = table.get("vary", {})
+    for values in product(*vary.values()) if vary else ():
+        varied = dict(zip(vary, values, strict=True))
+        words = [value if isinstance(value, str) else f"{key} {value}" for key, value in varied.items()]
+        yield ", ".join(words), varied
 
 
 def rendered(flight: Path) -> bool:

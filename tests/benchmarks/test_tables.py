@@ -104,12 +104,21 @@ def test_rows_are_kept_until_forgotten(tmp_path: Path, monkeypatch: pytest.Monke
     assert [json.loads(line)["benchmark"] for line in path.read_text().splitlines()] == ["b"]
 
 
-def test_cases_are_all_combinations(tmp_path: Path) -> None:
+TABLES = """
+[x]
+vary = { flight = ["a", "b"], seed = [1, 2] }
+simulate = { scale = 0.5 }
+[x.named]
+y = { seed = 7 }
+"""
+
+
+def test_cases_are_all_combinations_and_the_named_ones(tmp_path: Path) -> None:
     path = tmp_path / "cases.toml"
-    path.write_text('["x"]\nvary = { flight = ["a", "b"], seed = [1, 2] }\nsimulate = { scale = 0.5 }\n')
+    path.write_text(TABLES)
     found = cases("x", path)
-    assert [case.name for case in found] == ["a, seed 1", "a, seed 2", "b, seed 1", "b, seed 2"]
-    assert found[1].flight.name == "flight=a,scale=0.5,seed=2"
+    assert [case.name for case in found] == ["y", "a, seed 1", "a, seed 2", "b, seed 1", "b, seed 2"]
+    assert [case.flight.name for case in found[:3:2]] == ["scale=0.5,seed=7", "flight=a,scale=0.5,seed=2"]
 
 
 def test_errors_of_check_points_by_hand() -> None:
