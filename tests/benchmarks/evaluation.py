@@ -171,10 +171,21 @@ def stills_that_show(points_m: Array, views: Mapping[str, SimulatedView]) -> Ind
     count = np.zeros(len(points_m), dtype=np.int64)
     for view in views.values():
         pixels = view.project(points_m)
-        before = (points_m - view.centre_m) @ view.R_object_from_image[:, 2] < 0
         size = np.array([view.camera.width_px - 1, view.camera.height_px - 1])
-        count += before & np.all((pixels >= 0) & (pixels <= size), axis=1)
+        count += _in_field_of_view(points_m, view) & np.all((pixels >= 0) & (pixels <= size), axis=1)
     return count
+
+
+def _in_field_of_view(points_m: Array, view: SimulatedView) -> Flags:
+    """Tell which points lie within the cone through the picture's corners.
+
+    Far outside it the polynomial of the distortion folds back, and would put points into the picture that it never saw.
+    """
+    width, height = view.camera.width_px - 1.0, view.camera.height_px - 1.0
+    corners = view.camera.ideal_of(np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]]))
+    in_image = (points_m - view.centre_m) @ view.R_object_from_image
+    farthest = 1.01 * np.linalg.norm(corners, axis=1).max()
+    return np.asarray(np.linalg.norm(in_image[:, :2], axis=1) <= -in_image[:, 2] * farthest)
 
 
 def fewest_ties(shared: Indices) -> int:

@@ -149,8 +149,12 @@ def test_stills_that_show_a_point_are_counted() -> None:
         str(n): SimulatedView(camera=camera, centre_m=np.array(centre), R_object_from_image=rotation)
         for n, (centre, rotation) in enumerate(places)
     }
-    points = np.array([[2.5, 0.0, 0.0], [-6.5, 0.0, 0.0], [11.5, 0.0, 0.0], [0.0, 7.0, 0.0]])
-    assert stills_that_show(points, views).tolist() == [2, 1, 1, 0]
+    seen = [[2.5, 0.0, 0.0], [-6.5, 0.0, 0.0], [11.5, 0.0, 0.0]]
+    # So far aside that the distortion's polynomial brings them back into the picture, one of them after all.
+    aside = [[0.0, float(y), 0.0] for y in range(7, 60)]
+    assert stills_that_show(np.array(seen + aside), views).tolist() == [2, 1, 1] + [0] * len(aside)
+    folded = views["0"].project(np.array(aside))
+    assert np.any(np.all((folded > 0.0) & (folded < [3999.0, 2999.0]), axis=1))
 
 
 def test_fewest_ties_are_of_neighbours() -> None:
