@@ -111,6 +111,16 @@ def simulate(
     flight: Annotated[
         Literal["constant", "trace"], typer.Option(help="One height, or following the ground.")
     ] = "constant",
+    terrain: Annotated[
+        Literal["embankment", "hills", "flat"], typer.Option(help="A crest of 10 m, rolling ground, or a plane.")
+    ] = "embankment",
+    texture: Annotated[
+        Literal["mixed", "repetitive", "low_contrast"],
+        typer.Option(help="Grass, gravel and soil in the sun; rows of like plants; raked sand without shadows."),
+    ] = "mixed",
+    brightness_jump: Annotated[
+        float, typer.Option(help="How much longer every second still is exposed, 0 to 0.6 (0.4: 40 %).")
+    ] = 0.0,
     scale: Annotated[float, typer.Option(help="Size of the stills against 4000 x 3000, 0.1 to 1.")] = 1.0,
     strips: Annotated[int, typer.Option(help="Strips, 1 to 5.")] = 3,
     stations: Annotated[int, typer.Option(help="Stills in each strip, 2 to 13.")] = 11,
@@ -126,7 +136,7 @@ def simulate(
     seed: Annotated[int, typer.Option(help="Of everything that is random.")] = 1,
     workers: Workers = CORES,
 ) -> None:
-    """Simulate a flight over an embankment: stills, video, positions, control and check points, and the truth."""
+    """Simulate a flight over a known site: stills, video, positions, control and check points, and the truth."""
     from uavkit import workflow
 
     with progress_shown() as progress:
@@ -134,6 +144,9 @@ def simulate(
             out,
             {
                 "flight": flight,
+                "terrain": terrain,
+                "texture": texture,
+                "brightness_jump": brightness_jump,
                 "scale": scale,
                 "strips": strips,
                 "stations_per_strip": stations,

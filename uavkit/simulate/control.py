@@ -12,7 +12,8 @@ from uavkit.simulate.camera import SimulatedView
 from uavkit.simulate.kernels import CELL_M, COARSE
 from uavkit.simulate.options import SimulationOptions
 from uavkit.simulate.site import CRS, site_frame
-from uavkit.simulate.world import SHAPE, World, along_across, enu_from_site
+from uavkit.simulate.terrain import SHAPE
+from uavkit.simulate.world import World, along_across, enu_from_site
 
 TRIANGLE = ((-0.82, -0.70), (0.80, -0.55), (0.05, 0.72))
 """Of the first three control points, in half extents of the flown area."""

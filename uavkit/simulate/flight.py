@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from uavkit.core.arrays import Array, Indices
 from uavkit.simulate.camera import SimulatedCamera, SimulatedView
-from uavkit.simulate.options import FlightKind, SimulationOptions, VideoStandard
+from uavkit.simulate.options import FlightKind, SimulationOptions, Terrain, VideoStandard
+from uavkit.simulate.terrain import flown
 from uavkit.simulate.world import World, enu_from_site
 
 FRAME_INTERVAL_S = {VideoStandard.NTSC: 1001 / 30000, VideoStandard.PAL: 1 / 25, VideoStandard.NONE: 1001 / 30000}
@@ -126,8 +127,10 @@ def plan_stations(world: World, options: SimulationOptions) -> Array:
     for strip in range(options.strips):
         stations[strip, :, 0] = along if strip % 2 == 0 else along[::-1]
         stations[strip, :, 1] = across[strip]
-    if options.flight is FlightKind.CONSTANT:
+    if options.flight is FlightKind.CONSTANT and options.terrain is Terrain.EMBANKMENT:
         stations[..., 2] = crest_height_m(world) + 10.0
+    elif options.flight is FlightKind.CONSTANT:
+        stations[..., 2] = float(flown(world.ground.heights_m).mean()) + 15.0
     else:
         stations[..., 2] = _mean_ground_m(world, stations) + 15.0
     return stations

@@ -271,18 +271,18 @@ def _tile_value(tiles: Bytes, m: int, lod: float, x: float, y: float) -> float:
 
 
 @inlined
-def _detail(tiles: Bytes, shares: Array, lod: float, x: float, y: float) -> float:
+def _detail(tiles: Bytes, layers: Array, shares: Array, lod: float, place: tuple[float, float]) -> float:
     """Fine detail of the ground, a relative brightness: two layers of each material's tile, turned by 37 degrees."""
     value = 0.0
     fade = min((3.6 - lod) / 0.6, 1.0)  # the map of the site holds what is left beyond
     if fade <= 0.0:
         return value
-    u, v = x / TILE_CELL_M, y / TILE_CELL_M
+    u, v = place[0] / TILE_CELL_M, place[1] / TILE_CELL_M
     p, q = (0.7986 * u - 0.6018 * v) / 1.31 + 431.0, (0.6018 * u + 0.7986 * v) / 1.31 + 977.0
     for m in range(3):
         if shares[m] > 0.06:
-            layers = 0.75 * _tile_value(tiles, m, lod, u, v) + 0.66 * _tile_value(tiles, m, lod - 0.39, p, q)
-            value += shares[m] * layers
+            straight, turned = _tile_value(tiles, m, lod, u, v), _tile_value(tiles, m, lod - 0.39, p, q)
+            value += shares[m] * (layers[m, 0] * straight + layers[m, 1] * turned)
     return fade * value
 
 
@@ -348,7 +348,8 @@ def render_rows(ground: "Ground", lattice: Array, view: Array, sampling: Array, 
     centre = view[3].copy()
     heights_m, bounds = ground.heights_m, ground.bounds
     radiance, levels, weights, tiles = ground.radiance, ground.levels, ground.weights, ground.tiles
-    tints, signal_index, signals_m = ground.tints, ground.signal_index, ground.signals_m
+    tints, layers = ground.tints, ground.layers
+    signal_index, signals_m = ground.signal_index, ground.signals_m
     shares = np.empty(4)
     weight = 1.0 / (down * right)
     row_start = 0.0
@@ -384,7 +385,7 @@ def render_rows(ground: "Ground", lattice: Array, view: Array, sampling: Array, 
                         white += weight * (0.55 if mark == 2 else 0.02)
                     else:
                         base = _map_value(radiance, levels, map_lod, along, across)
-                        fine = 0.36 * shares[3] * _detail(tiles, shares, tile_lod, along, across)
+                        fine = 0.36 * shares[3] * _detail(tiles, layers, shares, tile_lod, (along, across))
                         total += weight * base * max(1.0 + fine, 0.08)
             for k in range(3):
                 tint = shares[0] * tints[0, k] + shares[1] * tints[1, k] + shares[2] * tints[2, k]

@@ -5,6 +5,7 @@ domain, and so are periodic; ``cell_m`` is the distance of neighbouring values.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft
 
 from uavkit.simulate.kernels import Field, add_stones, lay_blades
@@ -38,7 +39,7 @@ def _filter(shape: tuple[int, int], cell_m: float, exponent: float, band_m: tupl
     frequency[0, 0] = 1.0
     shortest_m, longest_m = band_m
     response = frequency**-exponent
-    response /= 1.0 + (frequency * shortest_m) ** 16
+    response /= 1.0 + np.minimum(frequency * shortest_m, np.float32(200.0)) ** 16  # no overflow in float32
     response *= 1.0 - np.exp(-((frequency * longest_m) ** 4))
     response[0, 0] = 0.0
     return np.asarray(response, dtype=np.float32)
@@ -75,6 +76,14 @@ def grass_tile(rng: np.random.Generator) -> Field:
     return _finish(field + 0.3 * soil_tile(rng))
 
 
+def split_tile(field: Field) -> tuple[Field, Field]:
+    """A periodic tile's waves that belong to the map of the site, without their mean, and its fine detail."""
+    spectrum = fft.rfft2(field - field.mean())
+    spectrum *= _filter(field.shape, TILE_CELL_M, 0.0, (2.0 * TILE_CELL_M, TILE_LONGEST_M))
+    fine = np.asarray(fft.irfft2(spectrum, s=field.shape), dtype=np.float32)
+    return np.asarray(field - field.mean() - fine, dtype=np.float32), fine
+
+
 def _finish(field: Field) -> Field:
     """Take away the waves that the map of the site holds; mean 0, standard deviation 1."""
     spectrum = fft.rfft2(field)
@@ -88,3 +97,13 @@ def halved(field: Field) -> Field:
     rows, columns = field.shape[0] // 2 * 2, field.shape[1] // 2 * 2
     f = field[:rows, :columns]
     return (f[0::2, 0::2] + f[1::2, 0::2] + f[0::2, 1::2] + f[1::2, 1::2]) * np.float32(0.25)
+
+
+def mip_levels(field: Field, count: int) -> tuple[Field, NDArray[np.int64]]:
+    """A map and its halvings, flat, with (offset, rows, columns) of each."""
+    fields = [field]
+    for _ in range(count - 1):
+        fields.append(halved(fields[-1]))
+    offsets = np.cumsum([0] + [f.size for f in fields[:-1]])
+    levels = np.array([(o, *f.shape) for o, f in zip(offsets, fields, strict=True)], dtype=np.int64)
+    return np.concatenate([f.ravel() for f in fields]), levels

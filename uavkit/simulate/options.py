@@ -8,11 +8,34 @@ from uavkit.core.errors import InputError
 from uavkit.core.records import FieldOrder
 
 
+class Terrain(Enum):
+    """Shape of the site."""
+
+    EMBANKMENT = "embankment"
+    """A crest 10 m above its feet."""
+    HILLS = "hills"
+    """Rolling ground with 6 to 8 m between its highest and lowest place, no line in it straight."""
+    FLAT = "flat"
+    """Within 0.3 m of a plane: the camera and the heights of a single-height block hold on to little."""
+
+
+class Texture(Enum):
+    """What covers the site, and the light upon it."""
+
+    MIXED = "mixed"
+    """Grass, gravel and soil in patches, boulders and boxes, in the sun."""
+    REPETITIVE = "repetitive"
+    """Rows of crop, 0.51 m apart, the same plant every 0.25 m, under an overcast sky."""
+    LOW_CONTRAST = "low_contrast"
+    """Raked sand under an overcast sky: a few grey values of contrast."""
+
+
 class FlightKind(Enum):
     """How the height of the exposure stations follows the ground."""
 
     CONSTANT = "constant"
-    """One height for all: 10 m above the crest, 20 m above the foot."""
+    """One height for all: 10 m above the crest of the embankment, 20 m above its foot; elsewhere 15 m above the mean
+    ground."""
     TRACE = "trace"
     """15 m above the ground below each station."""
 
@@ -43,6 +66,10 @@ class SimulationOptions:
     """Of everything that is random; the same seed gives the same files."""
     scale: float = 1.0
     """Size of the stills against 4000 x 3000, 0.1 to 1; the field of view stays."""
+    terrain: Terrain = Terrain.EMBANKMENT
+    texture: Texture = Texture.MIXED
+    brightness_jump: float = 0.0
+    """By how much every second still is exposed longer than the one before, and the video with it, 0 to 0.6."""
     flight: FlightKind = FlightKind.CONSTANT
     strips: int = 3
     """1 to 5; flown to and fro."""
@@ -91,6 +118,7 @@ class SimulationOptions:
 _RANGES: tuple[tuple[str, float, float], ...] = (
     ("seed", 0, 2**31 - 1),
     ("scale", 0.1, 1.0),
+    ("brightness_jump", 0.0, 0.6),
     ("strips", 1, 5),
     ("stations_per_strip", 2, 13),
     ("station_spacing_m", 2.0, 12.0),

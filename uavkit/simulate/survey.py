@@ -16,6 +16,7 @@ from uavkit.formats.atomic import atomic_path, write_text
 from uavkit.formats.control_file import write_gcp_list, write_points_csv
 from uavkit.formats.kml import write_positions
 from uavkit.simulate import truth
+from uavkit.simulate.brightness import still_factors
 from uavkit.simulate.camera import SimulatedCamera, SimulatedView, true_camera
 from uavkit.simulate.control import TruePoint, choose_points, observe_points, surveyed
 from uavkit.simulate.flight import Flight, make_flight
@@ -89,7 +90,7 @@ class Scene:
 def make_scene(options: SimulationOptions) -> Scene:
     """Lay out world, camera, flight, points and errors of a survey; the same options give the same scene."""
     rng = np.random.default_rng([options.seed, 11])
-    bare = make_world(options.seed)
+    bare = make_world(options.seed, options.terrain, options.texture)
     camera, flight = true_camera(options.seed, options.scale), make_flight(bare, options)
     count = len(flight.exposure_s)
     names = tuple(f"R{10001 + n:07d}.JPG" for n in range(count))
@@ -105,7 +106,7 @@ def make_scene(options: SimulationOptions) -> Scene:
         camera=camera,
         flight=flight,
         names=names,
-        gains=np.exp(rng.normal(0.0, 0.13, count)),
+        gains=np.exp(rng.normal(0.0, 0.13, count)) * still_factors(count, options.brightness_jump),
         clock=CameraClock(offset_s=float(rng.uniform(60, 400) * rng.choice([-1, 1])), drift_ppm=20.0),
         waypoints=measure_waypoints(flight.positions_m(flight.exposure_s), options),
         control=observed[: options.control_points],
@@ -211,8 +212,10 @@ def _readme(scene: Scene) -> str:
     video, argument = f"video.avi           the finder's video, interlaced, {order} field first\n", " --video video.avi"
     if scene.options.video_standard is VideoStandard.NONE:
         video, argument = "", ""
-    seed, scale, flight = scene.options.seed, scene.options.scale, scene.options.flight.value
-    return f"""A simulated survey (seed {seed}, scale {scale:g}, flight {flight}).
+    options = scene.options
+    seed, scale, flight = options.seed, options.scale, options.flight.value
+    site = f"terrain {options.terrain.value}, texture {options.texture.value}"
+    return f"""A simulated survey (seed {seed}, scale {scale:g}, flight {flight}, {site}).
 
 stills/             {len(scene.names)} stills with the EXIF of the camera; its clock is off
 {video}positions.kml       positions of the waypoints, one for each still, from the receiver on board (good to metres)

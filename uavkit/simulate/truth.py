@@ -11,6 +11,7 @@ import numpy as np
 from uavkit.core.arrays import Array
 from uavkit.core.errors import InputError
 from uavkit.formats.atomic import write_text
+from uavkit.simulate.options import Terrain
 from uavkit.simulate.site import CRS, HEIGHT_ELLIPSOID_M, LATITUDE_DEG, LONGITUDE_DEG, gps_time_ns, site_frame
 from uavkit.simulate.world import AZIMUTH_RAD, along_across
 
@@ -93,17 +94,14 @@ def _video(finder: "Finder") -> dict[str, Any]:
 
 
 def _block(scene: "Scene") -> dict[str, Any]:
-    """Station spacing, heights above ground and overlaps, on the crest and at the foot (mean over the stations)."""
+    """Station spacing, heights above ground and overlaps, on the crest and at the foot (mean over the stations), or
+    where the ground below the stations is nearest and farthest."""
     camera, stations = scene.camera, scene.flight.stations_m
     options = scene.options
     long_side = camera.width_px / camera.principal_distance_px
     short_side = camera.height_px / camera.principal_distance_px
-    _, across = along_across(stations[:, 0], stations[:, 1])
-    centre_strip = np.abs(across) < options.strip_spacing_m * 0.51
     ground = scene.world.height_m(stations[:, 0], stations[:, 1])
-    crest = float(ground[centre_strip].mean())
-    height = float(stations[:, 2].mean())
-    levels = {"crest": max(height - crest, 1.0), "foot": height}
+    levels = _levels_m(scene, ground)
     return {
         "station_spacing_m": options.station_spacing_m,
         "strip_spacing_m": options.strip_spacing_m,
@@ -114,6 +112,17 @@ def _block(scene: "Scene") -> dict[str, Any]:
         "side_overlap": {k: 1 - options.strip_spacing_m / (h * short_side) for k, h in levels.items()},
         "height_above_ground_at_stations_m": (stations[:, 2] - ground).round(2).tolist(),
     }
+
+
+def _levels_m(scene: "Scene", ground_m: Array) -> dict[str, float]:
+    """Mean height of the stations above two levels of the ground; ``ground_m`` lies below the stations."""
+    stations, options = scene.flight.stations_m, scene.options
+    height = float(stations[:, 2].mean())
+    if options.terrain is not Terrain.EMBANKMENT:
+        return {"highest": float((stations[:, 2] - ground_m).min()), "lowest": float((stations[:, 2] - ground_m).max())}
+    _, across = along_across(stations[:, 0], stations[:, 1])
+    centre_strip = np.abs(across) < options.strip_spacing_m * 0.51
+    return {"crest": max(height - float(ground_m[centre_strip].mean()), 1.0), "foot": height}
 
 
 def write_truth(path: Path, truth: dict[str, Any]) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from uavkit.core.arrays import Array, Image
 from uavkit.core.progress import Progress
 from uavkit.core.records import FieldOrder
+from uavkit.simulate.brightness import finder_factor
 from uavkit.simulate.camera import SimulatedCamera
 from uavkit.simulate.flight import FieldState, Flight, Wobble, make_wobble
 from uavkit.simulate.kernels import Field, finder_signal, render_rows
@@ -97,7 +98,9 @@ class Finder:
         picture = self._picture(index)
         rng = np.random.default_rng([self.options.seed, 5, index])
         noise = rng.standard_normal(picture.shape[:2], dtype=np.float32) * np.float32(NOISE_GREY)
-        gain = float(np.exp(self.drift.at(np.array([index * self.flight.field_interval_s]))[0, 0]))
+        time_s = index * self.flight.field_interval_s
+        gain = float(np.exp(self.drift.at(np.array([time_s]))[0, 0]))
+        gain *= finder_factor(time_s, self.flight.exposure_s, self.options.brightness_jump)
         luminance = np.empty(picture.shape[:2], dtype=np.uint8)
         colours = np.empty((2, HEIGHT_PX // 4, WIDTH_PX // 2), dtype=np.uint8)
         finder_signal(picture, noise, gain, gaussian_taps(BANDWIDTH_SIGMA_PX, 3), luminance, colours)
