@@ -50,13 +50,14 @@ def honesty(wrong_share: float) -> dict[str, Any]:
         "failed_blocks": failed,
         "check_points": len(squares),
         "mean_chi_square_of_a_point": float(np.mean(squares)),
+        "median_chi_square_of_a_point": float(np.median(squares)),
         "sigma0_squared": float(np.mean(variances)),
         "sigma0_squared_standard_error": float(np.sqrt(2.0 / np.sum(redundancies))),
         "sigma0_squared_deviation_sigmas": float((np.mean(variances) - 1.0) / np.sqrt(2.0 / np.sum(redundancies))),
     }
 
 
-@pytest.mark.parametrize("wrong_share", [0.0, 0.2])
+@pytest.mark.parametrize("wrong_share", [0.0, 0.05, 0.2])
 def test_errors_are_as_predicted(wrong_share: float) -> None:
     case = f"{round(100 * wrong_share)} % wrong rays"
     row = measured("honesty", case, lambda: honesty(wrong_share))
