@@ -17,11 +17,13 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from tests.benchmarks.evaluation import MarkedPlaces, errors_to_truth, root_mean_squares
 from tests.benchmarks.subprocesses import THREADS
 from uavkit.core.arrays import Array
 from uavkit.formats.control_file import SurveyedPoints, read_surveyed_points
 from uavkit.process.absolute import fit_similarity
 from uavkit.simulate.site import site_frame
+from uavkit.simulate.truth import read_truth
 
 CENTRE_FROM_CORNER_PX = 0.5
 """COLMAP counts pixels from the corner of the first one, uavkit from its centre."""
@@ -74,18 +76,21 @@ def _map(database: Path, stills: Path, out: Path) -> dict[int, pycolmap.Reconstr
     return dict(pycolmap.incremental_mapping(database, stills, out, options=options))
 
 
-def intersected(model: pycolmap.Reconstruction, surveyed: SurveyedPoints) -> tuple[Array, Array]:
-    """Return marked points intersected in the model and as surveyed in the site's local frame, each (n, 3), of those
-    that at least two oriented stills show."""
+def intersected(model: pycolmap.Reconstruction, surveyed: SurveyedPoints) -> tuple[list[str], Array, Array]:
+    """Return marked points by name, intersected in the model and as surveyed in the site's local frame, each (n, 3).
+
+    Points that fewer than two oriented stills show are left out.
+    """
     images = {image.name: image for image in model.images.values() if image.has_pose}
-    places, ground = [], []
+    names, places, ground = [], [], []
     for point in surveyed.points:
         marks = [(images[m.image], np.array([m.column_px, m.row_px])) for m in point.marks if m.image in images]
         if len(marks) >= 2:
+            names.append(point.name)
             places.append(_intersected(model, marks))
             ground.append(point.coordinates)
     frame = site_frame()
-    return np.array(places).reshape(-1, 3), frame.enu_from_crs(np.array(ground).reshape(-1, 3), surveyed.crs)
+    return names, np.array(places).reshape(-1, 3), frame.enu_from_crs(np.array(ground).reshape(-1, 3), surveyed.crs)
 
 
 def _intersected(model: pycolmap.Reconstruction, marks: Iterable[tuple[Any, Array]]) -> Array:
@@ -113,21 +118,32 @@ def _projected(image: Any, camera: Any, place: Array) -> Array:
 
 
 def judged(model: pycolmap.Reconstruction, flight: Path) -> dict[str, Any]:
-    """Return the differences of the check points from their surveyed coordinates, and what else tells the quality."""
-    control = read_surveyed_points(flight / "control_points.csv")
-    check = read_surveyed_points(flight / "check_points.csv")
-    ground_from_model = fit_similarity(*intersected(model, control))
-    places, ground = intersected(model, check)
-    difference = ground_from_model.apply(places) - ground
+    """Return the errors of the check points, and what else tells the quality."""
+    places = _places(model, flight)
     return {
         "stills_oriented": model.num_reg_images(),
         "points": model.num_points3D(),
         "reprojection_px": model.compute_mean_reprojection_error(),
-        "check_points": len(difference),
-        "rmse_xy_mm": 1e3 * float(np.sqrt(np.mean(np.sum(difference[:, :2] ** 2, axis=1)))),
-        "rmse_z_mm": 1e3 * float(np.sqrt(np.mean(difference[:, 2] ** 2))),
+        "check_points": len(places.check_m),
+        **root_mean_squares("rmse", (places.check_m - places.check_surveyed_m) ** 2),
+        **errors_to_truth(places),
         "camera": [float(value) for value in next(iter(model.cameras.values())).params],
     }
+
+
+def _places(model: pycolmap.Reconstruction, flight: Path) -> MarkedPlaces:
+    """Return where the model puts the check points once its control points are brought to their surveyed places."""
+    truth = read_truth(flight / "truth" / "truth.json")
+    true = {p["name"]: np.array(p["position_m"]) for p in (*truth["control_points"], *truth["check_points"])}
+    used, model_m, control_m = intersected(model, read_surveyed_points(flight / "control_points.csv"))
+    names, check_m, surveyed_m = intersected(model, read_surveyed_points(flight / "check_points.csv"))
+    return MarkedPlaces(
+        check_m=fit_similarity(model_m, control_m).apply(check_m),
+        check_surveyed_m=surveyed_m,
+        check_true_m=np.array([true[name] for name in names]),
+        control_surveyed_m=control_m,
+        control_true_m=np.array([true[name] for name in used]),
+    )
 
 
 def main(flight: Path, work: Path, result: Path) -> None:

@@ -1,18 +1,22 @@
 """What a processed block is worth, measured against the truth of its simulated flight.
 
-Two errors of the check points are told. *Surveyed*: block minus surveyed coordinates, as the report has it; their
-predicted sigmas and joint covariance hold the block's precision and the survey's noise. *True*: block minus true
-coordinates. Judged is the first, for it is what a user sees.
+Several errors of the check points are told. Judged is block minus *surveyed* coordinates, for it is what a user sees in
+the report; the predicted sigmas and the joint covariance of these differences hold the block's precision and the
+survey's noise. Beside it: block minus *true* coordinates; the same after a similarity transformation to the truth, the
+error of the *shape* alone; and what an *exact* block would show that hangs on the same control points, for with three
+of these their noise is most of what check points show.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
 import numpy as np
 
 from uavkit.core.arrays import Array, Flags, Indices
-from uavkit.core.result import OrientedBlock
+from uavkit.core.result import OrientedBlock, PointDifference
+from uavkit.process.absolute import fit_similarity
 from uavkit.report.measures import determined_points, differences_m, rays_of_points, strip_ties
 from uavkit.simulate.camera import SimulatedCamera, SimulatedView
 from uavkit.simulate.kernels import CELL_M
@@ -35,15 +39,14 @@ def evaluated(result: OrientedBlock, truth: Mapping[str, Any]) -> dict[str, Any]
         "sigma0": result.adjustment.sigma0,
         "step_s": {step: round(seconds, 1) for step, seconds in result.seconds.items()},
         "check_points_expected": len(truth["check_points"]),
-        **check_point_errors(
-            differences_m(result.check), result.check_covariance_m2, surveyed_minus_true_m(result, truth)
-        ),
+        **check_point_errors(differences_m(result.check), result.check_covariance_m2),
+        **errors_to_truth(MarkedPlaces.of_block(result, truth)),
         **yielded(result, true_world(truth), views),
         "fewest_ties_of_neighbouring_strips": fewest_ties(strip_ties(result)[1]),
     }
 
 
-def check_point_errors(difference_m: Array, covariance_m2: Array, surveyed_minus_true_m: Array) -> dict[str, Any]:
+def check_point_errors(difference_m: Array, covariance_m2: Array) -> dict[str, Any]:
     """Return root mean square errors and their prediction, XY of both axes together, and chi-square of all of them.
 
     Differences (n, 3) are block minus survey, with their joint covariance (3 n, 3 n).
@@ -51,33 +54,68 @@ def check_point_errors(difference_m: Array, covariance_m2: Array, surveyed_minus
     variance = np.diag(covariance_m2).reshape(-1, 3)
     return {
         "check_points": len(difference_m),
-        **_root_mean_squares("rmse", difference_m**2),
-        **_root_mean_squares("rmse_predicted", variance),
-        **_root_mean_squares("rmse_true", (difference_m + surveyed_minus_true_m) ** 2),
+        **root_mean_squares("rmse", difference_m**2),
+        **root_mean_squares("rmse_predicted", variance),
         "chi_square": float(difference_m.ravel() @ np.linalg.solve(covariance_m2, difference_m.ravel())),
         "chi_square_freedom": difference_m.size,
         "chi_square_bound": chi_square_bound(difference_m.size),
     }
 
 
-def _root_mean_squares(name: str, squares_m2: Array) -> dict[str, float]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MarkedPlaces:
+    """Where a program puts the check points, with the truth, all in one local frame in metres."""
+
+    check_m: Array
+    """(n, 3) as computed."""
+    check_surveyed_m: Array
+    check_true_m: Array
+    control_surveyed_m: Array
+    """(c, 3), of the control points that were used; none without control."""
+    control_true_m: Array
+
+    @classmethod
+    def of_block(cls, result: OrientedBlock, truth: Mapping[str, Any]) -> "MarkedPlaces":
+        """Return the places of a processed block."""
+        frame, block = result.block.frame, result.block
+        if frame is None:
+            raise ValueError("the block lies nowhere on earth: its check points have no true coordinates")
+        points = [*truth["check_points"], *truth["control_points"]]
+        places = frame.enu_from_crs(np.array([point["crs_m"] for point in points]), truth["frame"]["crs"])
+        true = {point["name"]: place for point, place in zip(points, places, strict=True)}
+        surveyed = {p.name: np.array(p.position_m) for p in (*block.check_points, *block.control_points)}
+
+        def table(known: Mapping[str, Array], of: tuple[PointDifference, ...]) -> Array:
+            return np.array([known[point.name] for point in of]).reshape(-1, 3)
+
+        return cls(
+            check_m=table(surveyed, result.check) + differences_m(result.check),
+            check_surveyed_m=table(surveyed, result.check),
+            check_true_m=table(true, result.check),
+            control_surveyed_m=table(surveyed, result.control),
+            control_true_m=table(true, result.control),
+        )
+
+
+def errors_to_truth(places: MarkedPlaces) -> dict[str, float]:
+    """Return root mean square errors against the truth, of the shape alone, and those an exact block would show."""
+    shape = fit_similarity(places.check_m, places.check_true_m).apply(places.check_m) - places.check_true_m
+    errors = {
+        **root_mean_squares("rmse_true", (places.check_m - places.check_true_m) ** 2),
+        **root_mean_squares("rmse_shape", shape**2),
+    }
+    if len(places.control_true_m) >= 3:
+        exact = fit_similarity(places.control_true_m, places.control_surveyed_m).apply(places.check_true_m)
+        errors |= root_mean_squares("rmse_of_exact_block", (exact - places.check_surveyed_m) ** 2)
+    return errors
+
+
+def root_mean_squares(name: str, squares_m2: Array) -> dict[str, float]:
     """Return roots of the mean of squares (n, 3), in mm: of both horizontal axes together, and of heights."""
     return {
         f"{name}_xy_mm": 1e3 * float(np.sqrt(np.mean(squares_m2[:, 0] + squares_m2[:, 1]))),
         f"{name}_z_mm": 1e3 * float(np.sqrt(np.mean(squares_m2[:, 2]))),
     }
-
-
-def surveyed_minus_true_m(result: OrientedBlock, truth: Mapping[str, Any]) -> Array:
-    """Return the error of the surveyed coordinates of the block's check points in its local frame, shape (n, 3)."""
-    frame = result.block.frame
-    if frame is None:
-        raise ValueError("the block lies nowhere on earth: its check points have no true coordinates")
-    names = [point["name"] for point in truth["check_points"]]
-    places = frame.enu_from_crs(np.array([point["crs_m"] for point in truth["check_points"]]), truth["frame"]["crs"])
-    true = dict(zip(names, places, strict=True))
-    surveyed = {point.name: np.array(point.position_m) for point in result.block.check_points}
-    return np.array([surveyed[point.name] - true[point.name] for point in result.check]).reshape(-1, 3)
 
 
 def chi_square_bound(freedom: int) -> float:

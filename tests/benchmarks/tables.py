@@ -24,7 +24,7 @@ Rows = Sequence[Row]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bar:
-    """What the rows of some benchmarks are to reach."""
+    """What the rows of some benchmarks are to reach; without limits it is only told."""
 
     rows: Mapping[str, int]
     """How many rows of each benchmark are needed for a judgement."""
@@ -143,6 +143,10 @@ BARS: tuple[Bar, ...] = (
     Bar(rows=SIX, what="fewest ties of neighbouring strips", measure=smallest(TIES), least=1),
     Bar(rows=BOTH, what="mean RMSE XY over COLMAP's", measure=ratio_of_means("rmse_xy_mm"), most=0.8),
     Bar(rows=BOTH, what="mean RMSE Z over COLMAP's", measure=ratio_of_means("rmse_z_mm"), most=0.8),
+    Bar(rows=BOTH, what="mean XY error of shape over COLMAP's", measure=ratio_of_means("rmse_shape_xy_mm")),
+    Bar(rows=BOTH, what="mean Z error of shape over COLMAP's", measure=ratio_of_means("rmse_shape_z_mm")),
+    Bar(rows=SIX, what="mean RMSE XY of an exact block, mm", measure=mean_of("rmse_of_exact_block_xy_mm")),
+    Bar(rows=SIX, what="mean RMSE Z of an exact block, mm", measure=mean_of("rmse_of_exact_block_z_mm")),
     Bar(rows=EVERY, what="RMSE over predicted, all blocks", measure=pooled_prediction, least=0.8, most=1.25),
     Bar(rows=EVERY, what="blocks beyond chi-square's 99.9 %", measure=beyond_chi_square, most=0),
     Bar(rows={"accuracy RTK": 3}, what="mean RMSE XY, mm", measure=mean_of("rmse_xy_mm"), most=12.0),
@@ -186,6 +190,8 @@ def judge(bar: Bar, rows: Mapping[str, Rows]) -> Judgement:
     measured = bar.measure(*groups) if all(there) else float("nan")
     if sum(there) < needed:
         return Judgement(bar=bar, measured=measured, verdict=f"{sum(there)} of {needed} rows")
+    if not bar.text:
+        return Judgement(bar=bar, measured=measured, verdict="")
     return Judgement(bar=bar, measured=measured, verdict="met" if bar.least <= measured <= bar.most else "missed")
 
 

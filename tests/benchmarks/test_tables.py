@@ -10,8 +10,10 @@ import pytest
 from tests.benchmarks import rows as kept
 from tests.benchmarks.blocks import cases
 from tests.benchmarks.evaluation import (
+    MarkedPlaces,
     check_point_errors,
     chi_square_bound,
+    errors_to_truth,
     fewest_ties,
     holds_a_point,
     stills_that_show,
@@ -29,6 +31,7 @@ from tests.benchmarks.tables import (
     ratio_of_means,
 )
 from uavkit.core.angles import rotation_from_omega_phi_kappa
+from uavkit.process.absolute import fit_similarity
 from uavkit.simulate.camera import SimulatedView, true_camera
 from uavkit.simulate.world import enu_from_site
 
@@ -122,15 +125,28 @@ def test_cases_are_all_combinations_and_the_named_ones(tmp_path: Path) -> None:
 
 
 def test_errors_of_check_points_by_hand() -> None:
-    """Two points of sigma 1 mm: 3, 4, 0 mm and 0, 0, 2 mm off; the survey was wrong by 1 mm in the second's height."""
-    difference = np.array([[3e-3, 4e-3, 0.0], [0.0, 0.0, 2e-3]])
-    told = check_point_errors(difference, 1e-6 * np.eye(6), np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1e-3]]))
+    """Two points of sigma 1 mm: 3, 4, 0 mm and 0, 0, 2 mm off."""
+    told = check_point_errors(np.array([[3e-3, 4e-3, 0.0], [0.0, 0.0, 2e-3]]), 1e-6 * np.eye(6))
     assert told["rmse_xy_mm"] == pytest.approx(np.sqrt(25 / 2))
     assert told["rmse_z_mm"] == pytest.approx(np.sqrt(2))
-    assert told["rmse_true_z_mm"] == pytest.approx(np.sqrt(0.5))
     assert told["rmse_predicted_xy_mm"] == pytest.approx(np.sqrt(2))
     assert told["rmse_predicted_z_mm"] == pytest.approx(1.0)
     assert (told["chi_square"], told["chi_square_freedom"]) == (pytest.approx(29.0), 6)
+
+
+def test_exact_shape_on_noisy_control_shows_the_noise_of_control() -> None:
+    rng = np.random.default_rng(2)
+    true, control = rng.uniform(0, 40, (9, 3)), rng.uniform(0, 40, (3, 3))
+    surveyed = control + rng.normal(0, 0.005, (3, 3))
+    found = fit_similarity(control, surveyed).apply(true)
+    places = MarkedPlaces(
+        check_m=found, check_surveyed_m=true, check_true_m=true, control_surveyed_m=surveyed, control_true_m=control
+    )
+    told = errors_to_truth(places)
+    assert told["rmse_shape_xy_mm"] == pytest.approx(0.0, abs=1e-6)
+    assert told["rmse_true_xy_mm"] > 0.5
+    assert told["rmse_of_exact_block_xy_mm"] == pytest.approx(told["rmse_true_xy_mm"])
+    assert told["rmse_of_exact_block_z_mm"] == pytest.approx(told["rmse_true_z_mm"])
 
 
 def test_ground_cells_hold_the_points_within_half_a_metre() -> None:
