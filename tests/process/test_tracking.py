@@ -302,7 +302,7 @@ def test_decayed_templates_are_renewed_with_their_warp(plane: Scene) -> None:
     eager = TrackingOptions(renewal_dissimilarity=0.0)  # every match counts as decayed
     outcome = follow(plane, pose, pictures, eager)
     error = outcome.error_px[outcome.alive]
-    assert outcome.alive.mean() > 0.9
+    assert outcome.alive.mean() > 0.85
     # renewed every third picture: the error adds up as a random walk, but nothing jumps
     assert np.quantile(error, 0.95) < 2.0
     lasting = follow(plane, pose, pictures)

@@ -7,9 +7,11 @@ import numpy as np
 
 from uavkit.core.arrays import Array, Flags
 from uavkit.core.errors import AdjustmentError
-from uavkit.process.kernels.affine import least_median_affine
+from uavkit.process.kernels.affine import affine_residuals, least_median_affine, least_squares_affine
 
 TRIPLES = 120
+MOST_JUDGES = 250
+"""Of many points about so many, evenly chosen, make and judge the triples: their median is as good."""
 LEAST_SCALE_PX = 0.15
 """Floor of the residuals' scale: of noise-free points the scale is zero and rounding would decide."""
 
@@ -37,12 +39,23 @@ def compose(third_from_second: Array, second_from_first: Array) -> Array:
     return np.column_stack([matrix, shift])
 
 
-def fit_affine(source_px: Array, target_px: Array) -> Array:
-    """Least squares affine transformation target_from_source (2, 3); at least three points not on a line."""
-    centre = source_px.mean(axis=0)
-    design = np.column_stack([source_px - centre, np.ones(len(source_px))])
-    solution = np.linalg.lstsq(design, target_px, rcond=None)[0].T
-    return np.column_stack([solution[:, :2], solution[:, 2] - solution[:, :2] @ centre])
+def fit_affine(source_px: Array, target_px: Array, counted: Flags | None = None) -> Array:
+    """Least squares affine transformation target_from_source (2, 3) of points (n, 2), or of those that are counted.
+
+    Raises AdjustmentError where they are fewer than three or lie on a line.
+    """
+    affine = np.zeros((2, 3))
+    rows = np.ones(len(source_px), np.bool_) if counted is None else counted
+    if not least_squares_affine(np.ascontiguousarray(source_px), np.ascontiguousarray(target_px), rows, affine):
+        raise AdjustmentError("the points of an affine motion lie on a line")
+    return affine
+
+
+def residuals_of(affine: Array, source_px: Array, target_px: Array) -> Array:
+    """Larger coordinate, without sign, of the residuals of points (n, 2) against an affine transformation, (n,)."""
+    largest = np.empty(len(source_px))
+    affine_residuals(np.ascontiguousarray(source_px), np.ascontiguousarray(target_px), affine, largest)
+    return largest
 
 
 def fit_affine_robustly(source_px: Array, target_px: Array, rng: np.random.Generator) -> AffineMotion:
@@ -54,22 +67,19 @@ def fit_affine_robustly(source_px: Array, target_px: Array, rng: np.random.Gener
     count = len(source_px)
     if count < 6:
         raise AdjustmentError(f"an affine motion needs at least 6 points, there are {count}")
-    triples = rng.integers(0, count, (TRIPLES, 3))
     best = np.zeros((2, 3))
     source, target = np.ascontiguousarray(source_px), np.ascontiguousarray(target_px)
-    median = least_median_affine(source, target, triples, best)
+    some = slice(None, None, max(1, count // MOST_JUDGES))
+    triples = rng.integers(0, len(source[some]), (TRIPLES, 3))
+    median = least_median_affine(np.ascontiguousarray(source[some]), np.ascontiguousarray(target[some]), triples, best)
     if not np.isfinite(median):
         raise AdjustmentError("the points of an affine motion lie on a line")
     scale = max(LEAST_SCALE_PX, 1.4826 * (1 + 5 / (2 * count - 6)) * float(np.sqrt(median)))
-    inliers = _within(best, source, target, scale)
+    inliers = residuals_of(best, source, target) <= 2.5 * scale
     for _ in range(2):
-        best = fit_affine(source[inliers], target[inliers])
-        inliers = _within(best, source, target, scale)
-    return AffineMotion(target_from_source=best, inliers=inliers, scale_px=scale)
-
-
-def _within(affine: Array, source_px: Array, target_px: Array, scale_px: float) -> Flags:
-    return np.asarray(np.abs(target_px - apply_affine(affine, source_px)).max(axis=1) <= 2.5 * scale_px)
+        best = fit_affine(source, target, inliers)
+        inliers = residuals_of(best, source, target) <= 2.5 * scale
+    return AffineMotion(target_from_source=best, inliers=np.asarray(inliers), scale_px=scale)
 
 
 def similarity_power(target_from_source: Array, exponent: float) -> Array:

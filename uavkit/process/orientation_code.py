@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 
 from uavkit.core.arrays import Array
 from uavkit.core.errors import InputError
-from uavkit.process.kernels.code_matching import code_templates, equal_slopes, match_packed, strip_spacing
+from uavkit.process.kernels.code_matching import (
+    MOST_WINDOW,
+    code_templates,
+    equal_slopes,
+    match_packed,
+    strip_spacing,
+)
 from uavkit.process.kernels.coding import code_picture, richness_picture, second_difference_histogram
 
 Codes = NDArray[np.uint8]
@@ -249,13 +255,13 @@ def match_codes_at(
     threshold is the reference's coding threshold (its noise, not that of the patch). The template is warped to the
     fraction of the predicted position, so that a perfect prediction meets the lowest point of the V.
     """
-    if window_px % 2 == 0:
-        raise InputError(f"window_px must be odd, is {window_px}")
+    if window_px % 2 == 0 or not 3 <= window_px <= MOST_WINDOW:
+        raise InputError(f"window_px must be odd and at most {MOST_WINDOW}, is {window_px}")
     count = plan.predicted_px.shape[0]
     found, scores, coded_share = np.empty((count, 2)), np.empty((count, 3)), np.empty(count)
     geometry = [np.ascontiguousarray(a, np.float64) for a in (plan.reference_px, plan.reference_from_target)]
     predicted = np.ascontiguousarray(plan.predicted_px, np.float64)
-    uncoded = np.array([64, 64 if variant is Dissimilarity.PAPER else 0], np.uint8)
+    free = int(variant is Dissimilarity.BOTH_UNCODED_EQUAL)
     picture = np.ascontiguousarray(reference)
     grey = np.zeros((window_px + 2, (_TEMPLATES_AT_ONCE + 1) * strip_spacing(window_px)), np.uint8)
     strip = np.empty_like(grey)
@@ -264,11 +270,12 @@ def match_codes_at(
         places = geometry[0][rows], geometry[1][rows], predicted[rows]
         code_templates(picture, *places, threshold, sector_tangents(), grey, strip, coded_share[rows])
         radii = np.where(coded_share[rows] < 0, 0, plan.radii_px[rows])
-        match_packed(strip, search_packed, window_px, predicted[rows], radii, uncoded, 2, found[rows], scores[rows])
-    step = 256 // CODE_COUNT
+        match_packed(
+            strip, search_packed, window_px, coded_share[rows], predicted[rows], radii, free, found[rows], scores[rows]
+        )
     return PointMatches(
         points_px=found,
-        dissimilarity=scores[:, 0] / step,
+        dissimilarity=scores[:, 0],
         ambiguity=(scores[:, 0] + 1e-9) / (scores[:, 1] + 1e-9),
         on_rim=scores[:, 2] == 1.0,
         coded_share=coded_share,

@@ -22,6 +22,7 @@ from uavkit.process.affine_motion import (
     fit_affine,
     fit_affine_robustly,
     nearest_similarity,
+    residuals_of,
     similarity_power,
 )
 from uavkit.process.kernels.affine import local_warps, neighbour_votes
@@ -238,8 +239,8 @@ def advance(state: TrackState, picture: TimedPicture, rng: np.random.Generator) 
     if not is_usable(state, picture):
         return _blind(state)
     packed = packed_codes(picture.image)
-    for motion, radius in _attempts(state, picture):
-        found = _follow(state, packed, motion, picture.time_s, radius, rng)
+    for attempt in _attempts(state, picture):
+        found = _follow(state, packed, attempt, picture.time_s, rng)
         if found is not None:
             return _moved(state, picture, found)
     return _blind(state)
@@ -249,17 +250,31 @@ def _blind(state: TrackState) -> TrackState:
     return replace(state, gaps=state.gaps + 1, blind_pictures=state.blind_pictures + 1)
 
 
-def _attempts(state: TrackState, picture: TimedPicture) -> Iterable[tuple[Array, int]]:
-    """Predicted transformations with the search radius that fits: the usual one, a wider one, a global search."""
+@dataclass(frozen=True, slots=True)
+class _Attempt:
+    """A predicted transformation (2, 3), and how widely to search about it."""
+
+    motion: Array
+    radius_px: int
+    least_share: float
+    """Of the visible points, to be found."""
+
+
+def _attempts(state: TrackState, picture: TimedPicture) -> Iterable[_Attempt]:
+    """What to try in turn: the predicted motion (or the whole picture's shift), a wider search, a global one."""
     options = state.options
-    known = state.motion is not None
-    motion = state.motion.over(picture.time_s - state.time_s) if state.motion is not None else np.eye(2, 3)
     usual = min(options.lost_radius_px, options.search_radius_px + state.blind_pictures // 2)
-    if known:
-        yield motion, usual
-    if not known or usual < options.lost_radius_px:
-        yield motion, options.lost_radius_px
-    yield coarse_motion(state.last_image, picture.image, motion), options.lost_radius_px
+    if state.motion is not None:
+        motion = state.motion.over(picture.time_s - state.time_s)
+        yield _Attempt(motion, usual, options.least_share)
+    else:
+        motion = np.eye(2, 3)
+        shift = coarse_shift(state.last_image, picture.image)
+        yield _Attempt(shift, min(usual + 1, options.lost_radius_px), max(_SHARE_BY_SHIFT, options.least_share))
+    if state.motion is None or usual < options.lost_radius_px:
+        yield _Attempt(motion, options.lost_radius_px, options.least_share)
+    turned = coarse_motion(state.last_image, picture.image, motion)
+    yield _Attempt(turned, options.lost_radius_px, options.least_share)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -274,10 +289,10 @@ class _Found:
 
 
 def _follow(
-    state: TrackState, packed: Grey, motion: Array, time_s: float, radius: int, rng: np.random.Generator
+    state: TrackState, packed: Grey, attempt: _Attempt, time_s: float, rng: np.random.Generator
 ) -> _Found | None:
     """Match all points about their prediction; None if too few are found for this to be the same scene."""
-    options = state.options
+    options, motion, radius = state.options, attempt.motion, attempt.radius_px
     seconds = time_s - state.time_s
     predicted = apply_affine(motion, state.points_px) + state.drift_px_s * seconds
     tried = state.misses <= options.most_misses
@@ -286,7 +301,7 @@ def _follow(
     good = _credible(matches, options)
     visible = matches.coded_share >= 0
     visible &= ~np.isnan(matches.points_px[:, 0])
-    if good.sum() < max(6, options.least_share * visible.sum()):
+    if good.sum() < max(6, attempt.least_share * visible.sum()):
         return None
     fresh = good & (state.misses == 0)
     fit_rows = fresh if fresh.sum() >= 6 else good
@@ -294,7 +309,7 @@ def _follow(
         step = fit_affine_robustly(state.points_px[fit_rows], matches.points_px[fit_rows], rng)
     except AdjustmentError:
         return None
-    if step.inliers.sum() < max(6, 0.5 * options.least_share * visible.sum()):
+    if step.inliers.sum() < max(6, 0.5 * attempt.least_share * visible.sum()):
         return None
     return _voted(state, matches, good, step.target_from_source, step.scale_px)
 
@@ -392,9 +407,7 @@ def _moved(state: TrackState, picture: TimedPicture, found: _Found) -> TrackStat
     """The state after a picture in which the points were found."""
     good, points = found.good, found.points_px
     seconds = picture.time_s - state.time_s
-    affine = (
-        _trimmed_affine(state.start_px[good], points[good]) if good.sum() >= 6 else compose(found.step, state.affine)
-    )
+    affine = _trimmed_affine(state.start_px, points, good) if good.sum() >= 6 else compose(found.step, state.affine)
     warps, good, points = _settled(state, affine, good, points)
     similarity = nearest_similarity(found.step, points)
     extra = apply_affine(found.step, state.points_px) - apply_affine(similarity, state.points_px)
@@ -442,12 +455,12 @@ def _missed(state: TrackState, matches: PointMatches, good: Flags) -> NDArray[np
     return np.where(good, 0, more)
 
 
-def _trimmed_affine(start_px: Array, current_px: Array) -> Array:
-    """Least squares affine of all, once more without the worst tenth."""
-    affine = fit_affine(start_px, current_px)
-    residuals = np.abs(current_px - apply_affine(affine, start_px)).max(axis=1)
-    kept = residuals <= np.quantile(residuals, 0.9)
-    return fit_affine(start_px[kept], current_px[kept]) if kept.sum() >= 6 else affine
+def _trimmed_affine(start_px: Array, current_px: Array, good: Flags) -> Array:
+    """Least squares affine of all good points, once more without the worst tenth."""
+    affine = fit_affine(start_px, current_px, good)
+    residuals = residuals_of(affine, start_px, current_px)
+    kept = good & (residuals <= np.quantile(residuals[good], 0.9))
+    return fit_affine(start_px, current_px, kept) if kept.sum() >= 6 else affine
 
 
 def _renewed(state: TrackState, good: Flags) -> TrackState:
@@ -477,16 +490,28 @@ _COARSE_ANGLES_DEG = (0.0, -5.0, 5.0, -10.0, 10.0, -15.0, 15.0, -20.0, 20.0, -25
 _FINE_ANGLES_DEG = (0.0, -2.5, 2.5, -1.25, 1.25)
 
 
+_SHARE_BY_SHIFT = 0.6
+"""Visible points to be found about the shift of the whole picture: with fewer the wider search finds more."""
+
+
 def coarse_motion(before: Grey, after: Grey, predicted: Array) -> Array:
     """after_from_before (2, 3) near a predicted one by phase correlation of pictures at a quarter of the size.
 
     Turns the earlier picture by angles about the prediction and takes the shift of the highest peak.
     """
-    size = (before.shape[1] // _COARSE, before.shape[0] // _COARSE)
-    small_before = cv2.resize(before, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    small_after = cv2.resize(after, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    best = _best_turn(small_before, small_after, predicted, _COARSE_ANGLES_DEG)
-    return _best_turn(small_before, small_after, best, _FINE_ANGLES_DEG)
+    small = _reduced(before), _reduced(after)
+    best = _best_turn(*small, predicted, _COARSE_ANGLES_DEG)
+    return _best_turn(*small, best, _FINE_ANGLES_DEG)
+
+
+def coarse_shift(before: Grey, after: Grey) -> Array:
+    """after_from_before (2, 3), a mere shift, by phase correlation of pictures at a quarter of the size."""
+    return _best_turn(_reduced(before), _reduced(after), np.eye(2, 3), (0.0,))
+
+
+def _reduced(image: Grey) -> NDArray[np.float32]:
+    size = (image.shape[1] // _COARSE, image.shape[0] // _COARSE)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _best_turn(

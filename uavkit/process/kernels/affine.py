@@ -5,6 +5,9 @@ from numpy.typing import NDArray
 
 from uavkit.process.kernels.jit import kernel
 
+_TOGETHER = 32
+"""Points whose neighbours are sorted at the same time: whole vector registers."""
+
 
 @kernel
 def _affine_of_triple(
@@ -63,17 +66,127 @@ def least_median_affine(
 
 
 @kernel
-def _median(values: NDArray[np.float64], number: int) -> float:
-    """Median of the first few values, which are put in order on the way."""
-    for i in range(1, number):
-        value = values[i]
-        j = i - 1
-        while j >= 0 and values[j] > value:
-            values[j + 1] = values[j]
-            j -= 1
-        values[j + 1] = value
-    middle = number // 2
-    return float(values[middle]) if number % 2 == 1 else float(0.5 * (values[middle - 1] + values[middle]))
+def _centres(
+    source: NDArray[np.float64], target: NDArray[np.float64], counted: NDArray[np.bool_], centres: NDArray[np.float64]
+) -> int:
+    """Means of the counted points: centres = (source x, y, target x, y); returns their number."""
+    number = 0
+    centres[:] = 0.0
+    for row in range(source.shape[0]):
+        if counted[row]:
+            number += 1
+            centres[0] += source[row, 0]
+            centres[1] += source[row, 1]
+            centres[2] += target[row, 0]
+            centres[3] += target[row, 1]
+    for k in range(4):
+        centres[k] /= max(number, 1)
+    return number
+
+
+@kernel
+def least_squares_affine(
+    source: NDArray[np.float64], target: NDArray[np.float64], counted: NDArray[np.bool_], affine: NDArray[np.float64]
+) -> bool:
+    """Least squares affine transformation (2, 3) of the counted points; False if they lie on a line (or are < 3)."""
+    centres = np.empty(4)
+    number = _centres(source, target, counted, centres)
+    nxx = nxy = nyy = 0.0
+    mixed = np.zeros((2, 2))
+    for row in range(source.shape[0]):
+        if counted[row]:
+            x, y = source[row, 0] - centres[0], source[row, 1] - centres[1]
+            u, v = target[row, 0] - centres[2], target[row, 1] - centres[3]
+            nxx += x * x
+            nxy += x * y
+            nyy += y * y
+            mixed[0, 0] += u * x
+            mixed[0, 1] += u * y
+            mixed[1, 0] += v * x
+            mixed[1, 1] += v * y
+    determinant = nxx * nyy - nxy * nxy
+    if number < 3 or determinant <= 1e-12 * (nxx + nyy) ** 2:
+        return False
+    for j in range(2):
+        affine[j, 0] = (mixed[j, 0] * nyy - mixed[j, 1] * nxy) / determinant
+        affine[j, 1] = (mixed[j, 1] * nxx - mixed[j, 0] * nxy) / determinant
+        affine[j, 2] = centres[2 + j] - affine[j, 0] * centres[0] - affine[j, 1] * centres[1]
+    return True
+
+
+@kernel
+def affine_residuals(
+    source: NDArray[np.float64], target: NDArray[np.float64], affine: NDArray[np.float64], largest: NDArray[np.float64]
+) -> None:
+    """Larger coordinate, without sign, of target - affine(source), (n,)."""
+    for row in range(source.shape[0]):
+        x, y = source[row, 0], source[row, 1]
+        rx = target[row, 0] - (affine[0, 0] * x + affine[0, 1] * y + affine[0, 2])
+        ry = target[row, 1] - (affine[1, 0] * x + affine[1, 1] * y + affine[1, 2])
+        largest[row] = max(abs(rx), abs(ry))
+
+
+@kernel
+def _sort_columns(values: NDArray[np.float64], rows: int) -> None:
+    """Sort each of the _TOGETHER columns of values (rows * _TOGETHER,) by exchanges of neighbours, all at once."""
+    for phase in range(rows):
+        for row in range(phase & 1, rows - 1, 2):
+            upper, lower = np.uint64(row * _TOGETHER), np.uint64((row + 1) * _TOGETHER)
+            for column in range(_TOGETHER):
+                a, b = values[upper + np.uint64(column)], values[lower + np.uint64(column)]
+                values[upper + np.uint64(column)] = a if a < b else b
+                values[lower + np.uint64(column)] = b if a < b else a
+
+
+@kernel
+def _middle(values: NDArray[np.float64], column: int, number: int) -> float:
+    """Median of the first few values of a sorted column."""
+    upper, lower = (number - 1) // 2, number // 2
+    return float(0.5 * (values[upper * _TOGETHER + column] + values[lower * _TOGETHER + column]))
+
+
+@kernel
+def _votes_of_some(
+    residuals: NDArray[np.float64],
+    counted: NDArray[np.bool_],
+    neighbours: NDArray[np.int64],
+    first: int,
+    medians: NDArray[np.float64],
+    spread: NDArray[np.float64],
+    votes: NDArray[np.int64],
+    work: NDArray[np.float64],
+) -> None:
+    """neighbour_votes for up to _TOGETHER rows from first on; work (3, k * _TOGETHER)."""
+    most = neighbours.shape[1]
+    some = min(_TOGETHER, residuals.shape[0] - first)
+    work[:] = np.inf
+    for column in range(some):
+        number = 0
+        for other in neighbours[first + column]:
+            if other >= 0 and counted[other]:
+                work[0, number * _TOGETHER + column] = residuals[other, 0]
+                work[1, number * _TOGETHER + column] = residuals[other, 1]
+                number += 1
+        votes[first + column] = number
+    _sort_columns(work[0], most)
+    _sort_columns(work[1], most)
+    for column in range(some):
+        row = first + column
+        medians[row, :] = 0.0
+        if votes[row] == 0:
+            continue
+        mx, my = _middle(work[0], column, votes[row]), _middle(work[1], column, votes[row])
+        medians[row, 0], medians[row, 1] = mx, my
+        number = 0
+        for other in neighbours[row]:
+            if other >= 0 and counted[other]:
+                away = max(abs(residuals[other, 0] - mx), abs(residuals[other, 1] - my))
+                work[2, number * _TOGETHER + column] = away
+                number += 1
+    _sort_columns(work[2], most)
+    for column in range(some):
+        row = first + column
+        spread[row] = 1.4826 * _middle(work[2], column, votes[row]) if votes[row] > 0 else 0.0
 
 
 @kernel
@@ -89,26 +202,9 @@ def neighbour_votes(
 
     neighbours (n, k) holds row numbers, -1 where there are fewer.
     """
-    most = neighbours.shape[1]
-    xs, ys = np.empty(most), np.empty(most)
-    for row in range(residuals.shape[0]):
-        number = 0
-        for other in neighbours[row]:
-            if other >= 0 and counted[other]:
-                xs[number], ys[number] = residuals[other, 0], residuals[other, 1]
-                number += 1
-        votes[row] = number
-        medians[row, :] = 0.0
-        spread[row] = 0.0
-        if number > 0:
-            mx, my = _median(xs, number), _median(ys, number)
-            medians[row, 0], medians[row, 1] = mx, my
-            number = 0
-            for other in neighbours[row]:
-                if other >= 0 and counted[other]:
-                    xs[number] = max(abs(residuals[other, 0] - mx), abs(residuals[other, 1] - my))
-                    number += 1
-            spread[row] = 1.4826 * _median(xs, number)
+    work = np.empty((3, neighbours.shape[1] * _TOGETHER))
+    for first in range(0, residuals.shape[0], _TOGETHER):
+        _votes_of_some(residuals, counted, neighbours, first, medians, spread, votes, work)
 
 
 @kernel

@@ -1,8 +1,9 @@
 """Matching of orientation codes and warping of grey-value patches: inner loops.
 
 Codes are packed into bytes: code * (256 / N), so that the circular difference is the plain difference of signed bytes,
-which wraps by itself; an uncoded pixel is 1 (no packed code is odd). Templates lie side by side in a strip, each in a
-multiple of PATCH_STRIDE columns: they are coded in long rows, and a row of one is a vector register or two.
+which wraps by itself; an uncoded pixel is 1 (no packed code is odd). For a search, template and search window are
+copied into rows of LANES bytes each: a row is a vector register, and the sums of all columns stay in bytes, as no
+column of MOST_WINDOW codes sums up to more than 255.
 """
 
 import numpy as np
@@ -11,8 +12,49 @@ from numpy.typing import NDArray
 from uavkit.process.kernels.coding import code_picture
 from uavkit.process.kernels.jit import kernel
 
-PATCH_STRIDE = 32
+LANES = 32
+MOST_WINDOW = 31
+"""Side of the largest template."""
 UNCODED = 1
+_ROWS_AT_ONCE = 7
+"""Rows of a template added up between two stores: the usual 21 is a multiple."""
+_APART = 2
+"""Placements beyond which another minimum counts as the second best."""
+_QUARTER = 4
+"""Cost of an uncoded pixel: a quarter of the circle of 16 codes."""
+
+
+@kernel
+def _sources(line: NDArray[np.int32], columns: int, fours: NDArray[np.uint32]) -> None:
+    """Index of the upper left one of the four pixels about each place on a line = (u, v, du, dv) in 1/65536 px."""
+    width = np.int32(columns)
+    u0, v0, du, dv = line[0], line[1], line[2], line[3]
+    for column in range(fours.shape[0]):
+        u = np.int32(u0 + np.int32(np.int32(column) * du))
+        v = np.int32(v0 + np.int32(np.int32(column) * dv))
+        fours[column] = np.uint32(np.int32(np.int32(v >> 16) * width) + np.int32(u >> 16))
+
+
+@kernel
+def _bilinear(
+    line: NDArray[np.int32], fours: NDArray[np.uint32], strip: NDArray[np.uint8], row: int, begin: int
+) -> None:
+    """Grey values between four pixels (a byte each: left, right, lower left, lower right), both rows in one product."""
+    u0, v0, du, dv = line[0], line[1], line[2], line[3]
+    even, whole = np.uint32(0xFF00FF), np.uint32(256)
+    first = np.uint64(begin)
+    for column in range(fours.shape[0]):
+        u = np.int32(u0 + np.int32(np.int32(column) * du))
+        v = np.int32(v0 + np.int32(np.int32(column) * dv))
+        fu = np.uint32(np.uint32(u >> 8) & np.uint32(255))
+        fv = np.uint32(np.uint32(v >> 8) & np.uint32(255))
+        left = np.uint32(fours[column] & even)
+        right = np.uint32(np.uint32(fours[column] >> np.uint32(8)) & even)
+        both = np.uint32(np.uint32(left * np.uint32(whole - fu)) + np.uint32(right * fu))
+        upper = np.uint32(np.uint32(both & np.uint32(0xFFFF)) * np.uint32(whole - fv))
+        lower = np.uint32(np.uint32(both >> np.uint32(16)) * fv)
+        grey = np.uint32(np.uint32(upper + lower) + np.uint32(32768)) >> np.uint32(16)
+        strip[np.uint64(row), first + np.uint64(column)] = np.uint8(grey)
 
 
 @kernel
@@ -26,90 +68,130 @@ def warp_patch(
 ) -> bool:
     """Bilinear grey values of a patch (m, m): pixel p comes from centre + source_from_patch (p - m // 2 - shift).
 
-    The patch lies in strip (m, ...) from column begin on. Returns False where it would reach beyond the image.
+    The patch lies in strip (m, ...) from column begin on. Returns False where it would reach beyond the image. Places,
+    the four pixels about each, and grey values are three loops: the first and the last are vector instructions.
     """
     rows, columns = image.shape
     size = strip.shape[0]
     half = size // 2
     a, b = source_from_patch[0, 0], source_from_patch[0, 1]
     c, d = source_from_patch[1, 0], source_from_patch[1, 1]
-    reach = half + 1.0
-    reach_x = (abs(a) + abs(b)) * reach + 1.0
-    reach_y = (abs(c) + abs(d)) * reach + 1.0
+    reach_x = (abs(a) + abs(b)) * (half + 1.0) + 1.0
+    reach_y = (abs(c) + abs(d)) * (half + 1.0) + 1.0
     if not (reach_x <= centre[0] < columns - 1 - reach_x and reach_y <= centre[1] < rows - 1 - reach_y):
         return False
     flat = image.ravel()
-    stride, right = np.uint64(columns), np.uint64(1)
+    right, down = np.uint64(1), np.uint64(columns)  # unsigned, or every index is tested for being negative
     one = 65536.0
-    ax, cy = np.int64(np.round(a * one)), np.int64(np.round(c * one))
+    line, fours = np.empty(4, np.int32), np.empty(size, np.uint32)
+    line[2], line[3] = np.int32(np.round(a * one)), np.int32(np.round(c * one))
     for row in range(size):
-        x = row - half - shift[1]
-        start = -half - shift[0]
-        u = np.int64(np.floor((centre[0] + a * start + b * x) * one + 0.5))
-        v = np.int64(np.floor((centre[1] + c * start + d * x) * one + 0.5))
-        line = strip[row, begin : begin + size]
+        x, y = -half - shift[0], row - half - shift[1]
+        line[0] = np.int32(np.floor((centre[0] + a * x + b * y) * one + 0.5))
+        line[1] = np.int32(np.floor((centre[1] + c * x + d * y) * one + 0.5))
+        _sources(line, columns, fours)
         for column in range(size):
-            # unsigned, or every index is tested for being negative
-            at = np.uint64((v >> 16) * columns + (u >> 16))
-            below = at + stride
-            fu, fv = np.int32((u >> 8) & 255), np.int32((v >> 8) & 255)
-            upper = (np.int32(flat[at]) << 8) + fu * (np.int32(flat[at + right]) - np.int32(flat[at]))
-            lower = (np.int32(flat[below]) << 8) + fu * (np.int32(flat[below + right]) - np.int32(flat[below]))
-            line[column] = np.uint8(((upper << 8) + fv * (lower - upper) + 32768) >> 16)
-            u += ax
-            v += cy
+            i = np.uint64(fours[column])
+            upper = np.uint32(flat[i]) | (np.uint32(flat[i + right]) << np.uint32(8))
+            lower = np.uint32(flat[i + down]) | (np.uint32(flat[i + down + right]) << np.uint32(8))
+            fours[column] = np.uint32(upper | np.uint32(lower << np.uint32(16)))
+        _bilinear(line, fours, strip, row, begin)
     return True
 
 
 @kernel
-def _dissimilarity(
-    template: NDArray[np.uint8],
-    mask: NDArray[np.uint8],
-    search: NDArray[np.uint8],
-    top: int,
-    left: int,
-    uncoded: NDArray[np.uint8],
-    sums: NDArray[np.uint16],
-) -> int:
-    """Sum of packed differences of one placement; uncoded = (difference if one, if both are uncoded)."""
-    width = template.shape[1]
-    for column in range(width):
-        sums[column] = 0
-    one, both = uncoded[0], uncoded[1]
-    for row in range(template.shape[0]):
-        t = template[row]
-        s = search[top + row, left : left + width]
+def _copy_rows(
+    codes: NDArray[np.uint8], place: tuple[int, int, int], limit: NDArray[np.uint8], copies: NDArray[np.uint8]
+) -> None:
+    """Copy packed codes into rows of LANES bytes, copies (2, rows * LANES): codes, and limit (LANES,) where coded.
+
+    place = (top, left, rows). Columns beyond the picture stay as they are: templates have no pixel there.
+    """
+    top, left, rows = place
+    width = min(LANES, codes.shape[1] - left)
+    for row in range(rows):
+        down, at = np.uint64(top + row), np.uint64(row * LANES)
         for column in range(width):
-            a, b = t[column], s[column]
-            difference = np.int8(a - b)
-            size = np.uint8(abs(difference))
-            either = np.uint8((a | b) & np.uint8(1))
-            all_two = np.uint8(a & b & np.uint8(1))
-            size = one if either else size
-            size = both if all_two else size
-            sums[column] += np.uint16(size & mask[column])
-    total = 0
-    for column in range(width):
-        total += sums[column]
-    return total
+            copies[0, at + np.uint64(column)] = codes[down, np.uint64(left) + np.uint64(column)]
+        for column in range(width):
+            code = codes[down, np.uint64(left) + np.uint64(column)]
+            copies[1, at + np.uint64(column)] = np.uint8(0) if code == UNCODED else limit[column]
+
+
+@kernel
+def _cost(template: NDArray[np.uint8], copies: NDArray[np.uint8], i: np.uint64, j: np.uint64) -> np.uint8:
+    """Difference in codes of one pixel of the template, 0 where that is uncoded."""
+    apart = np.uint8(np.uint8(abs(np.int8(template[0, i] - copies[0, j]))) >> np.uint8(4))
+    coded = copies[1, j]
+    cost = np.uint8(np.uint8(apart & coded) | np.uint8(np.uint8(~coded) & np.uint8(_QUARTER)))
+    return np.uint8(cost & template[1, i])
+
+
+@kernel
+def _placement(template: NDArray[np.uint8], copies: NDArray[np.uint8], offset: int, sums: NDArray[np.uint8]) -> None:
+    """Sum the differences of each column where the template's coded pixels lie offset bytes into the copied window."""
+    for top in range(0, template.shape[1], _ROWS_AT_ONCE * LANES):
+        first, other = np.uint64(top), np.uint64(top + offset)
+        for column in range(LANES):
+            i, j = first + np.uint64(column), other + np.uint64(column)
+            total = sums[column] if top > 0 else np.uint8(0)
+            for row in range(_ROWS_AT_ONCE):
+                down = np.uint64(row * LANES)
+                total = np.uint8(total + _cost(template, copies, i + down, j + down))
+            sums[column] = total
+
+
+@kernel
+def _sum_of_bytes(words: NDArray[np.uint64]) -> np.int64:
+    """Sum of the bytes of a few words: of every other byte in fields of 16 bits, and those by one product."""
+    every_other = np.uint64(0x00FF00FF00FF00FF)
+    fields = np.uint64(0)
+    for word in words:
+        fields += np.uint64(word & every_other) + np.uint64(np.uint64(word >> np.uint64(8)) & every_other)
+    return np.int64(np.uint64(fields * np.uint64(0x0001000100010001)) >> np.uint64(48))
+
+
+@kernel
+def _both_uncoded(template: NDArray[np.uint8], copies: NDArray[np.uint8], size: int, offset: int) -> int:
+    """Number of pixels that are uncoded in template and search."""
+    number = 0
+    for row in range(size):
+        for column in range(size):
+            at = row * LANES + column
+            number += 1 if template[1, at] == 0 and copies[1, at + offset] == 0 else 0
+    return number
 
 
 @kernel
 def _search(
     template: NDArray[np.uint8],
-    mask: NDArray[np.uint8],
+    uncoded: int,
     search: NDArray[np.uint8],
     window: NDArray[np.int64],
-    uncoded: NDArray[np.uint8],
+    copies: NDArray[np.uint8],
     totals: NDArray[np.int64],
 ) -> None:
-    """Fill totals (2 r + 1, 2 r + 1) for placements about the upper left corner; window = (top, left, radius)."""
-    radius = window[2]
-    sums = np.zeros(template.shape[1], np.uint16)
-    for down in range(2 * radius + 1):
-        for right in range(2 * radius + 1):
-            top, left = window[0] + down - radius, window[1] + right - radius
-            totals[down, right] = _dissimilarity(template, mask, search, top, left, uncoded, sums)
+    """Fill totals (2 r + 1, 2 r + 1) with summed differences; window = (top, left, radius, size, free if both uncoded).
+
+    A copied window holds a few placements side by side; a wide search needs several copies.
+    """
+    radius, size, free = window[2], window[3], window[4]
+    across = 2 * radius + 1
+    at_once = LANES + 1 - size
+    sums = np.zeros(LANES, np.uint8)
+    words = sums.view(np.uint64)
+    whole = np.full(LANES, 255, np.uint8)
+    for begin in range(0, across, at_once):
+        place = window[0] - radius, window[1] - radius + begin, size + 2 * radius
+        _copy_rows(search, place, whole, copies)
+        for down in range(across):
+            for right in range(begin, min(begin + at_once, across)):
+                offset = down * LANES + right - begin
+                _placement(template, copies, offset, sums)
+                total = _sum_of_bytes(words) + _QUARTER * uncoded
+                if free:
+                    total -= _QUARTER * _both_uncoded(template, copies, size, offset)
+                totals[down, right] = total
 
 
 @kernel
@@ -138,69 +220,100 @@ def _best_two(totals: NDArray[np.int64], size: int, apart: int, best: NDArray[np
 
 
 @kernel
+def _match_one(
+    template: NDArray[np.uint8],
+    uncoded: int,
+    search: NDArray[np.uint8],
+    window: NDArray[np.int64],
+    copies: NDArray[np.uint8],
+    totals: NDArray[np.int64],
+    result: NDArray[np.float64],
+) -> None:
+    """Search for one template; result = (x, y from the middle of the search, best, second best, 1 if on the rim)."""
+    radius, size = window[2], window[3]
+    best = np.zeros(4, np.int64)
+    _search(template, uncoded, search, window, copies, totals)
+    _best_two(totals, 2 * radius + 1, _APART, best)
+    down, right = best[0], best[1]
+    on_rim = down == 0 or right == 0 or down == 2 * radius or right == 2 * radius
+    dx = dy = 0.0
+    if not on_rim:
+        dx = equal_slopes(totals[down, right - 1], totals[down, right], totals[down, right + 1])
+        dy = equal_slopes(totals[down - 1, right], totals[down, right], totals[down + 1, right])
+    result[0] = right - radius + dx
+    result[1] = down - radius + dy
+    result[2] = best[2] / (size * size)
+    result[3] = best[3] / (size * size) if best[3] >= 0 else np.nan
+    result[4] = 1.0 if on_rim else 0.0
+
+
+@kernel
 def match_packed(
     strip: NDArray[np.uint8],
     search: NDArray[np.uint8],
     size: int,
+    coded_share: NDArray[np.float64],
     predicted: NDArray[np.float64],
     radii: NDArray[np.int64],
-    uncoded: NDArray[np.uint8],
-    apart: int,
+    free: int,
     found: NDArray[np.float64],
     scores: NDArray[np.float64],
 ) -> None:
     """Match the templates of a strip, shifted by the fraction of predicted (n, 2), in packed codes search (h, w).
 
-    found (n, 2) gets the sub-pixel position; scores (n, 3) the mean packed difference of the best placement, of the
+    free is 1 if pixels uncoded in both cost nothing, 0 if they cost a quarter of the circle as those uncoded in one.
+    found (n, 2) gets the sub-pixel position; scores (n, 3) the mean difference in codes of the best placement, of the
     second best well apart (nan without one), and 1 where the best lies on the rim of the search. Nan where the search
     leaves the picture.
     """
     rows, columns = search.shape
     spacing = strip_spacing(size)
-    stride = PATCH_STRIDE * ((size + PATCH_STRIDE - 1) // PATCH_STRIDE)
     half = size // 2
+    padded = _ROWS_AT_ONCE * ((size + _ROWS_AT_ONCE - 1) // _ROWS_AT_ONCE)
     largest = 1
     for point in range(radii.shape[0]):
         largest = max(largest, radii[point])
     totals = np.empty((2 * largest + 1, 2 * largest + 1), np.int64)
-    template = np.empty((size, stride), np.uint8)
-    mask = np.zeros(stride, np.uint8)
-    mask[:size] = 255
-    best = np.zeros(4, np.int64)
-    window = np.zeros(3, np.int64)
+    template = np.zeros((2, padded * LANES), np.uint8)
+    copies = np.zeros((2, (padded + 2 * largest + 1) * LANES), np.uint8)
+    inside = np.zeros(LANES, np.uint8)
+    inside[:size] = 255
+    window = np.zeros(5, np.int64)
+    result = np.zeros(5)
     for point in range(predicted.shape[0]):
         radius = radii[point]
         found[point, :] = np.nan
         scores[point, :] = np.nan
         if radius < 1 or not (np.isfinite(predicted[point, 0]) and np.isfinite(predicted[point, 1])):
             continue
-        column = np.int64(np.floor(predicted[point, 0] + 0.5))
-        row = np.int64(np.floor(predicted[point, 1] + 0.5))
-        window[0], window[1], window[2] = row - half, column - half, radius
-        if window[0] < radius or window[1] < radius:
+        left = np.int64(np.floor(predicted[point, 0] + 0.5)) - half
+        top = np.int64(np.floor(predicted[point, 1] + 0.5)) - half
+        if top < radius or left < radius or top + radius + size > rows or left + radius + size > columns:
             continue
-        if window[0] + radius + size > rows or window[1] + radius + stride > columns:
-            continue
-        template[:] = strip[1 : size + 1, point * spacing + 1 : point * spacing + 1 + stride]
-        _search(template, mask, search, window, uncoded, totals)
-        _best_two(totals, 2 * radius + 1, apart, best)
-        down, right = best[0], best[1]
-        on_rim = down == 0 or right == 0 or down == 2 * radius or right == 2 * radius
-        dx = dy = 0.0
-        if not on_rim:
-            dx = equal_slopes(totals[down, right - 1], totals[down, right], totals[down, right + 1])
-            dy = equal_slopes(totals[down - 1, right], totals[down, right], totals[down + 1, right])
-        found[point, 0] = predicted[point, 0] + right - radius + dx
-        found[point, 1] = predicted[point, 1] + down - radius + dy
-        scores[point, 0] = best[2] / (size * size)
-        scores[point, 1] = best[3] / (size * size) if best[3] >= 0 else np.nan
-        scores[point, 2] = 1.0 if on_rim else 0.0
+        window[0], window[1], window[2], window[3], window[4] = top, left, radius, size, free
+        _copy_rows(strip, (1, point * spacing + 1, size), inside, template)
+        uncoded = size * size - int(np.round(coded_share[point] * size * size))
+        _match_one(template, uncoded, search, window, copies, totals, result)
+        found[point, 0] = predicted[point, 0] + result[0]
+        found[point, 1] = predicted[point, 1] + result[1]
+        scores[point, 0], scores[point, 1], scores[point, 2] = result[2], result[3], result[4]
+
+
+@kernel
+def _count_coded(strip: NDArray[np.uint8], begin: int, size: int, counts: NDArray[np.uint8]) -> None:
+    """Number of coded pixels in each column of a template; 0 beyond its last column."""
+    counts[:] = 0
+    for row in range(1, size + 1):
+        for column in range(LANES):
+            code = strip[np.uint64(row), np.uint64(begin) + np.uint64(column)]
+            counts[column] = np.uint8(counts[column] + np.uint8(code != UNCODED))
+    counts[size:] = 0
 
 
 @kernel
 def strip_spacing(size: int) -> int:
     """Columns of a strip from one template to the next: the window and a pixel on either side, in whole registers."""
-    return PATCH_STRIDE * ((size + 2 + PATCH_STRIDE - 1) // PATCH_STRIDE)
+    return LANES * ((size + 2 + LANES - 1) // LANES)
 
 
 @kernel
@@ -232,13 +345,9 @@ def code_templates(
         if warp_patch(image, centres[point], source_from_patch[point], shift, grey, point * spacing):
             coded_share[point] = 0.0
     code_picture(grey, threshold, tangents, 256 // (4 * (tangents.shape[0] + 1)), UNCODED, strip)
+    sums = np.zeros(LANES, np.uint8)
+    words = sums.view(np.uint64)
     for point in range(centres.shape[0]):
-        if coded_share[point] < 0.0:
-            continue
-        begin = point * spacing + 1
-        coded = 0
-        for row in range(1, size + 1):
-            line = strip[row, begin : begin + size]
-            for column in range(size):
-                coded += 1 if line[column] != UNCODED else 0
-        coded_share[point] = coded / (size * size)
+        if coded_share[point] == 0.0:
+            _count_coded(strip, point * spacing + 1, size, sums)
+            coded_share[point] = _sum_of_bytes(words) / (size * size)
