@@ -51,8 +51,8 @@ class Judgement:
 
 
 def values(rows: Rows, name: str) -> np.ndarray:
-    """Return one value of each row, as floats (n,)."""
-    return np.array([float(row[name]) for row in rows])
+    """Return one value of each row, as floats (n,); NaN where a row has none."""
+    return np.array([float(row.get(name, np.nan)) for row in rows])
 
 
 def mean_of(name: str) -> Callable[[Rows], float]:
@@ -188,7 +188,7 @@ def judge(bar: Bar, rows: Mapping[str, Rows]) -> Judgement:
     groups = [rows.get(name, ()) for name in bar.rows]
     there, needed = [min(len(g), n) for g, n in zip(groups, bar.rows.values(), strict=True)], sum(bar.rows.values())
     measured = bar.measure(*groups) if all(there) else float("nan")
-    if sum(there) < needed:
+    if sum(there) < needed or np.isnan(measured):
         return Judgement(bar=bar, measured=measured, verdict=f"{sum(there)} of {needed} rows")
     if not bar.text:
         return Judgement(bar=bar, measured=measured, verdict="")
