@@ -133,12 +133,22 @@ def simulate(
     frames_between_stills: Annotated[
         float, typer.Option(help="Video frames from one still to the next, 30 to 300; fewer are a faster flight.")
     ] = 90.0,
+    gnss_sigma: Annotated[
+        float, typer.Option(help="Noise of the positions for each axis, m, 0 to 10; below 0.1 it is RTK.")
+    ] = 1.0,
+    gnss_outliers: Annotated[
+        int | None,
+        typer.Option(help="Positions that are off by 12 to 30 m; else one for every 11 stills up to 3, with RTK none."),
+    ] = None,
+    control_points: Annotated[int, typer.Option(help="Ground control points, 0 to 20.")] = 3,
     seed: Annotated[int, typer.Option(help="Of everything that is random.")] = 1,
     workers: Workers = CORES,
 ) -> None:
     """Simulate a flight over a known site: stills, video, positions, control and check points, and the truth."""
     from uavkit import workflow
 
+    usual = 0 if gnss_sigma < 0.1 else min(3, strips * stations // 11)
+    outliers = usual if gnss_outliers is None else gnss_outliers
     with progress_shown() as progress:
         made = workflow.simulate(
             out,
@@ -150,7 +160,9 @@ def simulate(
                 "scale": scale,
                 "strips": strips,
                 "stations_per_strip": stations,
-                "gnss_outliers": min(3, strips * stations // 11),
+                "gnss_sigma_m": gnss_sigma,
+                "gnss_outliers": outliers,
+                "control_points": control_points,
                 "video_standard": video_standard,
                 "field_order": field_order,
                 "frames_between_stills": frames_between_stills,
@@ -171,7 +183,7 @@ def ingest(
         str, typer.Option(help="As 'uavkit cameras' lists it, or a camera file; else as EXIF says.")
     ] = "",
     video: Annotated[Path | None, typer.Option(help="Video of the finder.")] = None,
-    positions: Annotated[Path | None, typer.Option(help="KML or KMZ with the exposure positions.")] = None,
+    positions: Annotated[Path | None, typer.Option(help="KML, KMZ or CSV of the exposure positions.")] = None,
     control_points: Annotated[Path | None, typer.Option(help="Ground control points with their marks.")] = None,
     check_points: Annotated[Path | None, typer.Option(help="Check points with their marks, held back.")] = None,
     height_datum: Annotated[

@@ -19,6 +19,7 @@ from uavkit.formats.camera_profiles import camera_folder, load_camera, read_came
 from uavkit.formats.control_file import ControlFileOptions, PixelOrigin, SurveyedPoints, read_surveyed_points
 from uavkit.formats.image_files import FileStillSource
 from uavkit.formats.kml import KmlPositions
+from uavkit.formats.positions_file import ImagePositions, read_image_positions
 from uavkit.formats.video import FileVideoSource
 from uavkit.project import IngestOptions, Manifest, Original, Project, Stage, Standing
 
@@ -37,16 +38,13 @@ DEMO: Mapping[str, Any] = {
 
 def simulate(out: Path, values: Mapping[str, Any], progress: Progress = silent) -> str:
     """Simulate a flight with options by name, and return the command that ingests it."""
-    from uavkit.simulate.survey import simulate_survey
+    from uavkit.simulate.survey import ingest_arguments, simulate_survey
 
-    made = simulate_survey(out, _simulation_options(values), progress)
+    options = _simulation_options(values)
+    made = simulate_survey(out, options, progress)
     label = {name: values.get(name) for name in ("flight", "scale", "strips", "stations_per_strip")}
     write_text(made.stills / SIMULATION_LABEL, json.dumps(label) + "\n")
-    video = f" --video {made.video}" if made.video else ""
-    return (
-        f"uavkit ingest SURVEY --images {made.stills}{video} --positions {made.positions} "
-        f"--control-points {made.control_points} --check-points {made.check_points}"
-    )
+    return " ".join(["uavkit ingest SURVEY", *(f"{name} {path}" for name, path in ingest_arguments(made, options))])
 
 
 def begin_survey(project: Project, originals: Mapping[str, Path], options: IngestOptions) -> None:
@@ -84,13 +82,17 @@ def _built_block(project: Project, progress: Progress) -> Block:
     sources = Sources(
         stills=_stills(project),
         video=_video(project),
-        positions=KmlPositions(positions) if positions else None,
+        positions=_listed_positions(positions) if positions else None,
         control=_surveyed(project, "control_points"),
         check=_surveyed(project, "check_points"),
     )
     profile = read_camera(camera) if camera else load_camera(told.camera) if told.camera else None
     datum = HeightDatum(told.height_datum) if told.height_datum else None
     return build_block(sources, profile, IngestOptions(crs=told.crs, height_datum=datum), progress)
+
+
+def _listed_positions(path: Path) -> KmlPositions | ImagePositions:
+    return KmlPositions(path) if path.suffix.lower() in (".kml", ".kmz") else read_image_positions(path)
 
 
 def _surveyed(project: Project, role: str) -> SurveyedPoints | None:

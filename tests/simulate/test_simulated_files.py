@@ -206,3 +206,45 @@ def test_pal_has_its_own_times(smallest_scene: Scene) -> None:
 def test_another_survey_in_the_folder_is_refused(smallest_survey: SimulatedSurvey, smallest_scene: Scene) -> None:
     with pytest.raises(InputError, match=r"R0010002\.JPG|video\.avi"):
         simulate_survey(smallest_survey.folder, replace(smallest_scene.options, video_standard=VideoStandard.NONE))
+
+
+def test_rtk_has_no_shift_of_metres_and_a_file_that_says_so(smallest_scene: Scene) -> None:
+    """Errors stay within five sigma of the stated noise; SBAS is off by more than a metre altogether."""
+    from uavkit.simulate.positions import RTK_SHIFT_SIGMA_M
+
+    asked = replace(smallest_scene.options, strips=3, stations_per_strip=11, gnss_outliers=0)
+    rtk, sbas = (make_scene(replace(asked, gnss_sigma_m=sigma)) for sigma in (0.02, 1.0))
+    true_m = rtk.flight.positions_m(rtk.flight.exposure_s)
+    off_m = rtk.waypoints.measured_m - true_m
+    assert np.abs(off_m).max() < 5 * 0.02
+    assert 0.7 < off_m.std() / 0.02 < 1.3
+    assert np.abs(rtk.waypoints.shift_m).max() < 1.5 * RTK_SHIFT_SIGMA_M
+    assert np.abs(sbas.waypoints.shift_m).min() >= 1.0
+    told = rtk.waypoints.of_images(rtk.names, 0.02)
+    assert [fix.name for fix in told.fixes] == list(rtk.names)
+    assert {fix.sigma_vertical_m for fix in told.fixes} == {0.02}
+    assert told.shift_sigma_m == (RTK_SHIFT_SIGMA_M,) * 3
+    assert sbas.waypoints.of_images(sbas.names, 1.0).shift_sigma_m is None
+
+
+def test_positions_by_image_are_those_of_the_waypoints(smallest_survey: SimulatedSurvey, smallest_scene: Scene) -> None:
+    from uavkit.formats.positions_file import read_image_positions
+    from uavkit.simulate.site import site_frame
+
+    fixes = read_image_positions(smallest_survey.image_positions).fixes
+    place = np.array([[fix.latitude_deg, fix.longitude_deg, fix.height_m] for fix in fixes])
+    measured = site_frame().enu_from_geographic(*place.T)
+    assert np.abs(measured - smallest_scene.waypoints.measured_m).max() < 2e-4
+
+
+def test_without_points_no_file_of_points_is_written(smallest_scene: Scene, tmp_path: Path) -> None:
+    asked = replace(
+        smallest_scene.options, scale=0.1, video_standard=VideoStandard.NONE, control_points=0, check_points=0
+    )
+    paths = simulate_survey(tmp_path, asked)
+    assert (paths.control_points, paths.check_points, paths.gcp_list) == (None, None, None)
+    assert not list(tmp_path.glob("*points*"))
+    assert "control" not in (tmp_path / "README.txt").read_text(encoding="utf-8")
+    (tmp_path / "control_points.csv").write_text("of another survey", encoding="utf-8")
+    with pytest.raises(InputError, match=r"control_points\.csv"):
+        simulate_survey(tmp_path, asked)

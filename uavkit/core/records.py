@@ -21,6 +21,8 @@ class GnssFix:
     sigma_horizontal_m: float | None = None
     """For each axis; None where the source does not say."""
     sigma_vertical_m: float | None = None
+    sigma_east_north_m: tuple[float, float] | None = None
+    """Where the source tells the axes apart; then ``sigma_horizontal_m`` is their root mean square."""
     name: str = ""
 
     def __post_init__(self) -> None:

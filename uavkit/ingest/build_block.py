@@ -17,8 +17,17 @@ from uavkit.core.points import CheckPoint, ControlPoint
 from uavkit.core.progress import Progress, silent
 from uavkit.core.records import GnssFix, StillInfo
 from uavkit.formats.control_file import SurveyedPoints
+from uavkit.formats.positions_file import ImagePositions
 from uavkit.ingest.control import MarkedPoints, height_notes, local_points, match_marks
-from uavkit.ingest.positions import JoinedPositions, PositionOptions, exif_positions, fix_sigmas, join_positions
+from uavkit.ingest.positions import (
+    JoinedPositions,
+    PositionOptions,
+    common_sigma,
+    exif_positions,
+    fix_sigmas,
+    join_named,
+    join_positions,
+)
 from uavkit.ingest.still_matching import PreparedStills, prepare_stills
 from uavkit.ingest.stills import camera_of_stills, check_one_camera, check_overlap
 from uavkit.ingest.video_sync import SyncOptions, synchronise_prepared
@@ -35,8 +44,9 @@ class Sources:
 
     stills: StillSource
     video: VideoSource | None = None
-    positions: GnssReceiver | None = None
-    """Listed positions; without them the stills' EXIF positions are used."""
+    positions: GnssReceiver | ImagePositions | None = None
+    """Listed positions; without them the stills' EXIF positions are used. Those that name their images are joined by
+    these names alone."""
     control: SurveyedPoints | None = None
     check: SurveyedPoints | None = None
 
@@ -100,7 +110,10 @@ def build_block(
         video=sync,
         notes=(*notes, *sync_notes, *joined.notes, *joined.discarded, *control.notes, *check.notes),
     )
-    return _with_points(_with_positions(block, joined, options, bool(control.surveyed.points)), control, check)
+    block = _with_positions(block, joined, options, bool(control.surveyed.points))
+    stated = sources.positions.shift_sigma_m if isinstance(sources.positions, ImagePositions) else None
+    block = _with_common_sigma(block, joined, stated, len(control.surveyed.points))
+    return _with_points(block, control, check)
 
 
 def _unreadable_headers(stills: StillSource) -> dict[str, str]:
@@ -127,14 +140,23 @@ def _video(
 
 
 def _positions(
-    source: GnssReceiver | None, stills: Sequence[StillInfo], absent: Sequence[str], options: IngestOptions
+    source: GnssReceiver | ImagePositions | None,
+    stills: Sequence[StillInfo],
+    absent: Sequence[str],
+    options: IngestOptions,
 ) -> JoinedPositions:
     """Return listed positions, else those in EXIF; with the height datum that counts."""
+    if isinstance(source, ImagePositions):
+        return _with_datum(join_named(stills, source, absent), options)
     fixes = list(source.fixes()) if source is not None else []
     joined = join_positions(stills, fixes, absent, options.positions) if fixes else exif_positions(stills)
     if fixes and joined.count == 0 and any(info.position is not None for info in stills):
         own = exif_positions(stills)
         joined = replace(own, notes=(*joined.notes, *own.notes), discarded=joined.discarded)
+    return _with_datum(joined, options)
+
+
+def _with_datum(joined: JoinedPositions, options: IngestOptions) -> JoinedPositions:
     if options.height_datum is None:
         return joined
     datum = options.height_datum
@@ -224,6 +246,28 @@ def _with_positions(block: Block, joined: JoinedPositions, options: IngestOption
         shift_sigma_m=shift,
     )
     return replace(block, gnss=gnss, notes=(*block.notes, *notes))
+
+
+def _with_common_sigma(
+    block: Block, joined: JoinedPositions, stated: tuple[float, float, float] | None, control_points: int
+) -> Block:
+    """Set the a priori sigma of the positions' common shift: what the file states, else that of RTK and PPK.
+
+    The latter only where control does not fix the datum: there the shift is free, and a base station whose coordinates
+    are off does no harm.
+    """
+    if block.gnss is None or block.gnss.shift_sigma_m is not None:
+        return block
+    if stated is not None:
+        return replace(block, gnss=replace(block.gnss, shift_sigma_m=stated))
+    found = common_sigma(joined) if control_points < LEAST_FOR_DATUM else None
+    if found is None:
+        return block
+    note = (
+        f"the positions state sigmas of RTK: their common shift is held to zero within {max(found):.3g} m; where the "
+        "base station is known less well, state '# shift_sigma_m:' in the file of positions, or give control points"
+    )
+    return replace(block, gnss=replace(block.gnss, shift_sigma_m=found), notes=(*block.notes, note))
 
 
 def _with_points(block: Block, control: MarkedPoints, check: MarkedPoints) -> Block:

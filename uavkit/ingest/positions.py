@@ -14,8 +14,10 @@ from itertools import pairwise
 import numpy as np
 
 from uavkit.core.arrays import Array, Flags
+from uavkit.core.errors import InputError
 from uavkit.core.frames import LocalFrame
 from uavkit.core.records import GnssFix, StillInfo
+from uavkit.formats.positions_file import ImagePositions
 from uavkit.ingest.sequence_alignment import (
     AlignmentOptions,
     SequenceAlignment,
@@ -44,6 +46,8 @@ LEAST_FOR_ORDER = 0.51
 CERTAIN = 0.9995
 APART = 6.0
 """Steps longer than this many usual ones lead to no exposure, at the ends of a list; outliers are nearer."""
+CARRIER_PHASE_SIGMA_M = 0.1
+"""Positions that state less than this are those of RTK or PPK with fixed ambiguities."""
 FAR_M = 20_000.0
 """Positions this far from the median of all are none of this flight."""
 
@@ -127,7 +131,57 @@ def fix_sigmas(fix: GnssFix, from_exif: bool, options: PositionOptions) -> tuple
     horizontal = options.exif_sigma_horizontal_m if from_exif else options.sigma_horizontal_m
     vertical = options.exif_sigma_vertical_m if from_exif else options.sigma_vertical_m
     h = fix.sigma_horizontal_m or horizontal
-    return h, h, fix.sigma_vertical_m or vertical
+    east, north = fix.sigma_east_north_m or (h, h)
+    return east, north, fix.sigma_vertical_m or vertical
+
+
+def common_sigma(joined: JoinedPositions) -> tuple[float, float, float] | None:
+    """Return the a priori sigma of the error that fixes of a carrier-phase solution have in common; None for others.
+
+    Where every fix states its sigmas, and none of their medians reaches ``CARRIER_PHASE_SIGMA_M``, the ambiguities are
+    fixed; what is left in common is the base station's error, which is taken for as large as a fix's own.
+    """
+    fixes = [fix for fix in joined.fixes if fix is not None]
+    if not fixes or any(fix.sigma_horizontal_m is None or fix.sigma_vertical_m is None for fix in fixes):
+        return None
+    median_m = np.median([fix_sigmas(fix, joined.from_exif, PositionOptions()) for fix in fixes], axis=0)
+    if float(median_m.max()) >= CARRIER_PHASE_SIGMA_M:
+        return None
+    east, north, up = median_m.tolist()
+    return east, north, up
+
+
+def join_named(infos: Sequence[StillInfo], listed: ImagePositions, absent: Sequence[str] = ()) -> JoinedPositions:
+    """Return the position of each still by the names that a file of positions gives, with or without their ending.
+
+    ``absent`` names stills that were taken but cannot be read. Raises InputError where no name is that of a still, or
+    two are that of the same one.
+    """
+    slots = [_Slot(name=info.name, info=info) for info in infos] + [_Slot(name=name, info=None) for name in absent]
+    known = _known_names(slots)
+    pairs: dict[int, tuple[int, float]] = {}
+    strange = []
+    for j, (fix, line) in enumerate(zip(listed.fixes, listed.lines, strict=True)):
+        row = known.get(fix.name.casefold())
+        if row is None:
+            strange.append(f"line {line}: {fix.name}")
+        elif row in pairs:
+            first = listed.lines[pairs[row][0]]
+            raise InputError(f"{listed.source}: lines {first} and {line} both give a position of {slots[row].name}")
+        else:
+            pairs[row] = (j, 1.0)
+    if not pairs:
+        raise InputError(f"{listed.source}: no position bears the name of a still ({strange[0]}; {infos[0].name} ...)")
+    discarded = [f"{listed.source}: {what}: no such still, the position is not used" for what in strange]
+    notes = ["positions joined with stills by their names"]
+    without = [slot.name for row, slot in enumerate(slots) if slot.info is not None and row not in pairs]
+    if without:
+        notes.append(f"{len(without)} stills without a position: {', '.join(without)}")
+    fixes = tuple(listed.fixes[pairs[row][0]] if row in pairs else None for row in range(len(infos)))
+    probability = np.array([0.0 if fix is None else 1.0 for fix in fixes])
+    return JoinedPositions(
+        fixes=fixes, probability=probability, from_exif=False, discarded=tuple(discarded), notes=tuple(notes)
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -178,12 +232,18 @@ def _called(fixes: Sequence[GnssFix], index: int) -> str:
     return f"position {index + 1} ({name})" if name else f"position {index + 1}"
 
 
-def _by_name(slots: Sequence[_Slot], fixes: Sequence[GnssFix]) -> dict[int, tuple[int, float]] | None:
-    """Return pairs where at least half of the positions bear a still's name (with or without its ending)."""
+def _known_names(slots: Sequence[_Slot]) -> dict[str, int]:
+    """Return the index of each still by its name with and without ending."""
     known: dict[str, int] = {}
     for index, slot in enumerate(slots):
         known[slot.name.casefold()] = index
         known.setdefault(slot.name.rsplit(".", 1)[0].casefold(), index)
+    return known
+
+
+def _by_name(slots: Sequence[_Slot], fixes: Sequence[GnssFix]) -> dict[int, tuple[int, float]] | None:
+    """Return pairs where at least half of the positions bear a still's name (with or without its ending)."""
+    known = _known_names(slots)
     rows = [known.get(fix.name.strip().casefold()) for fix in fixes]
     hits = [row for row in rows if row is not None]
     if 2 * len(hits) < len(fixes) or not hits or len(set(hits)) != len(hits):

@@ -54,7 +54,7 @@ def choose_points(world: World, stations_m: Array, views: Sequence[SimulatedView
             gaps = np.linalg.norm((tries * half)[:, None] - np.array(places)[None], axis=2).min(axis=1)
             wanted = tries[np.argmax(gaps)] * half
         places.append(_best_place(rng, world, views, wanted, half))
-    enu = np.column_stack([np.array(places), np.zeros(len(places))]) @ enu_from_site().T
+    enu = np.column_stack([np.array(places).reshape(-1, 2), np.zeros(len(places))]) @ enu_from_site().T
     enu[:, 2] = world.height_m(enu[:, 0], enu[:, 1])
     return enu
 

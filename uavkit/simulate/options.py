@@ -86,13 +86,13 @@ class SimulationOptions:
     """Mean over a strip, in NTSC frames (PAL takes the same time), 30 to 300."""
     frozen_picture: FrozenPicture = FrozenPicture.LAST_FIELDS
     gnss_sigma_m: float = 1.0
-    """Noise of a waypoint's position for each axis, 0 to 10 m."""
+    """Noise of a waypoint's position for each axis, 0 to 10 m; below 0.1 m it is RTK, without a shift of metres."""
     gnss_outliers: int = 3
     """Waypoints that are off by 12 to 30 m."""
     control_points: int = 3
-    """3 to 20."""
+    """0 to 20; 0: no control file is written."""
     check_points: int = 11
-    """0 to 60."""
+    """0 to 60; 0: no check file is written."""
     control_sigma_m: float = 0.005
     """Noise of the control points' coordinates for each axis, 0.0001 to 1 m."""
     check_sigma_m: float = 0.002
@@ -126,7 +126,7 @@ _RANGES: tuple[tuple[str, float, float], ...] = (
     ("frames_between_stills", 30.0, 300.0),
     ("gnss_sigma_m", 0.0, 10.0),
     ("gnss_outliers", 0, 20),
-    ("control_points", 3, 20),
+    ("control_points", 0, 20),
     ("check_points", 0, 60),
     ("control_sigma_m", 1e-4, 1.0),
     ("check_sigma_m", 1e-4, 1.0),

@@ -15,13 +15,14 @@ from uavkit.core.progress import Progress, silent
 from uavkit.formats.atomic import atomic_path, write_text
 from uavkit.formats.control_file import write_gcp_list, write_points_csv
 from uavkit.formats.kml import write_positions
+from uavkit.formats.positions_file import write_image_positions
 from uavkit.simulate import truth
 from uavkit.simulate.brightness import still_factors
 from uavkit.simulate.camera import SimulatedCamera, SimulatedView, true_camera
 from uavkit.simulate.control import TruePoint, choose_points, observe_points, surveyed
 from uavkit.simulate.flight import Flight, make_flight
 from uavkit.simulate.options import SimulationOptions, VideoStandard
-from uavkit.simulate.positions import WaypointPositions, measure_waypoints
+from uavkit.simulate.positions import RTK_SIGMA_M, WaypointPositions, measure_waypoints
 from uavkit.simulate.site import CAMERA_ZONE_HOURS, VIDEO_START_UTC
 from uavkit.simulate.stills import StillSettings, render_still, write_still
 from uavkit.simulate.video import Finder, make_finder, write_video
@@ -38,9 +39,13 @@ class SimulatedSurvey:
     video: Path | None
     """None where no video was asked for."""
     positions: Path
-    control_points: Path
-    check_points: Path
-    gcp_list: Path
+    """Waypoints, without sigmas."""
+    image_positions: Path
+    """The same positions by image, with their sigmas."""
+    control_points: Path | None
+    """None where there are no control points, as for the next two."""
+    check_points: Path | None
+    gcp_list: Path | None
     truth: Path
 
 
@@ -123,10 +128,8 @@ def simulate_survey(out: Path, options: SimulationOptions, progress: Progress = 
     paths = _paths(out, options)
     _refuse_another_survey(paths, scene.names)
     write_positions(paths.positions, "Waypoints", scene.waypoints.fixes())
-    control = surveyed(scene.control, options.control_sigma_m, options, 1)
-    write_points_csv(paths.control_points, control)
-    write_gcp_list(paths.gcp_list, control)
-    write_points_csv(paths.check_points, surveyed(scene.check, options.check_sigma_m, options, 2))
+    write_image_positions(paths.image_positions, scene.waypoints.of_images(scene.names, options.gnss_sigma_m))
+    _write_points(paths, scene)
     truth.write_truth(paths.truth, truth_of(scene))
     _write_field_poses(out / "truth" / "field_poses.npz", scene.flight)
     write_text(out / "README.txt", _readme(scene))
@@ -137,11 +140,24 @@ def simulate_survey(out: Path, options: SimulationOptions, progress: Progress = 
     return paths
 
 
+def _write_points(paths: SimulatedSurvey, scene: Scene) -> None:
+    options = scene.options
+    control = surveyed(scene.control, options.control_sigma_m, options, 1)
+    if paths.control_points is not None:
+        write_points_csv(paths.control_points, control)
+    if paths.gcp_list is not None:
+        write_gcp_list(paths.gcp_list, control)
+    if paths.check_points is not None:
+        write_points_csv(paths.check_points, surveyed(scene.check, options.check_sigma_m, options, 2))
+
+
 def _refuse_another_survey(paths: SimulatedSurvey, names: tuple[str, ...]) -> None:
-    """Stills or a video left from another survey would be taken for part of this one."""
+    """Stills, a video or points left from another survey would be taken for part of this one."""
     left = sorted({path.name for path in paths.stills.glob("*.JPG")} - set(names))
-    if paths.video is None and (paths.folder / "video.avi").exists():
-        left.append("video.avi")
+    ours = {paths.video, paths.control_points, paths.check_points, paths.gcp_list}
+    for name in ("video.avi", "control_points.csv", "check_points.csv", "gcp_list.txt"):
+        if paths.folder / name not in ours and (paths.folder / name).exists():
+            left.append(name)
     if left:
         raise InputError(f"{paths.folder} holds another survey ({left[0]}): name a new folder, or empty this one")
 
@@ -152,9 +168,10 @@ def _paths(out: Path, options: SimulationOptions) -> SimulatedSurvey:
         stills=out / "stills",
         video=None if options.video_standard is VideoStandard.NONE else out / "video.avi",
         positions=out / "positions.kml",
-        control_points=out / "control_points.csv",
-        check_points=out / "check_points.csv",
-        gcp_list=out / "gcp_list.txt",
+        image_positions=out / "positions.csv",
+        control_points=out / "control_points.csv" if options.control_points else None,
+        check_points=out / "check_points.csv" if options.check_points else None,
+        gcp_list=out / "gcp_list.txt" if options.control_points else None,
         truth=out / "truth" / "truth.json",
     )
 
@@ -205,28 +222,47 @@ def truth_of(scene: Scene) -> dict[str, Any]:
     return truth.survey_truth(scene, finder)
 
 
+def ingest_arguments(paths: SimulatedSurvey, options: SimulationOptions) -> list[tuple[str, Path]]:
+    """Return the options of ``uavkit ingest`` for a simulated survey with their files; RTK comes with its sigmas."""
+    positions = paths.image_positions if options.gnss_sigma_m < RTK_SIGMA_M else paths.positions
+    files = [
+        ("--images", paths.stills),
+        ("--video", paths.video),
+        ("--positions", positions),
+        ("--control-points", paths.control_points),
+        ("--check-points", paths.check_points),
+    ]
+    return [(name, path) for name, path in files if path is not None]
+
+
 def _readme(scene: Scene) -> str:
     """What lies where, and how to process it."""
-    sigma_mm = 1000 * scene.options.control_sigma_m
-    order = scene.options.field_order.value
-    video, argument = f"video.avi           the finder's video, interlaced, {order} field first\n", " --video video.avi"
-    if scene.options.video_standard is VideoStandard.NONE:
-        video, argument = "", ""
     options = scene.options
-    seed, scale, flight = options.seed, options.scale, options.flight.value
+    paths = _paths(Path(), options)
+    quality = "RTK, good to centimetres" if options.gnss_sigma_m < RTK_SIGMA_M else "good to metres"
+    control = f"{len(scene.control)} control points with their marks in the stills"
+    files = [
+        (paths.stills, f"{len(scene.names)} stills with the EXIF of the camera; its clock is off"),
+        (paths.video, f"the finder's video, interlaced, {options.field_order.value} field first"),
+        (paths.positions, f"positions of the waypoints, one for each still, from the receiver on board ({quality})"),
+        (paths.image_positions, "the same by image, with the sigma of each"),
+        (paths.control_points, f"{control}, sigma {1000 * options.control_sigma_m:g} mm"),
+        (paths.check_points, f"{len(scene.check)} check points: held back, to judge the result"),
+        (paths.gcp_list, "the control points in OpenDroneMap's form"),
+        (paths.truth.parent, "what is true; no stage of the processing reads it"),
+    ]
+    folders = (paths.stills, paths.truth.parent)
+    listed = [(f"{path}/" if path in folders else f"{path}", what) for path, what in files if path is not None]
+    lines = "\n".join(f"{name:<20}{what}" for name, what in listed)
+    arguments = [f"{name} {path}" for name, path in ingest_arguments(paths, options)]
+    command = " \\\n        ".join(" ".join(arguments[n : n + 3]) for n in range(0, len(arguments), 3))
     site = f"terrain {options.terrain.value}, texture {options.texture.value}"
-    return f"""A simulated survey (seed {seed}, scale {scale:g}, flight {flight}, {site}).
+    return f"""A simulated survey (seed {options.seed}, scale {options.scale:g}, flight {options.flight.value}, {site}).
 
-stills/             {len(scene.names)} stills with the EXIF of the camera; its clock is off
-{video}positions.kml       positions of the waypoints, one for each still, from the receiver on board (good to metres)
-control_points.csv  {len(scene.control)} control points with their marks in the stills, sigma {sigma_mm:g} mm
-check_points.csv    {len(scene.check)} check points: held back, to judge the result
-gcp_list.txt        the control points in OpenDroneMap's form
-truth/              what is true; no stage of the processing reads it
+{lines}
 
 Process it with
 
-    uavkit ingest SURVEY --images stills{argument} --positions positions.kml \\
-        --control-points control_points.csv --check-points check_points.csv
+    uavkit ingest SURVEY {command}
     uavkit run SURVEY
 """
