@@ -30,6 +30,11 @@ class AdjustmentInput:
     """A priori; a parameter of sigma 0 stays fixed. The a priori value is ``interior_prior``'s, or ``interior``'s."""
     interior_prior: InteriorOrientation | None = None
     """Values that the a priori sigmas belong to, where ``interior`` is already a better approximation."""
+    interiors: tuple[InteriorOrientation, ...] = ()
+    """Where not all images have the same interior orientation: approximate, and a priori, values of each."""
+    interior_index: Indices | None = None
+    """(n,) row in ``interiors`` of each image; None: ``interior`` holds for all. Where no two images share one, its
+    free parameters count among the unknowns of the image, else they are few and count for the block."""
     projection_centres_m: Array
     """(n, 3) approximate."""
     R_object_from_image: Array
@@ -39,6 +44,13 @@ class AdjustmentInput:
     rays: Rays
     gnss: GnssObservations | None = None
     control: ControlObservations | None = None
+
+    def __post_init__(self) -> None:
+        index = self.interior_index
+        if (index is None) != (len(self.interiors) == 0):
+            raise ValueError("interiors and interior_index belong together")
+        if index is not None and not np.array_equal(np.unique(index), np.arange(len(self.interiors))):
+            raise ValueError(f"interior_index must name each of {len(self.interiors)} interiors, and no other")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,5 +128,9 @@ class AdjustmentResult:
     """Rows of the points for which a joint covariance was asked for."""
     joint_covariance_m2: Array = field(default_factory=lambda: np.zeros((0, 0)))
     """(3 j, 3 j) covariance of all joint points together."""
+    interiors: tuple[InteriorOrientation, ...] = ()
+    """Each interior orientation of the input; ``interior`` is the first."""
+    interior_covariances: Array = field(default_factory=lambda: np.zeros((0, 10, 10)))
+    """(g, 10, 10)."""
     notes: tuple[str, ...] = ()
     """In words: doubtful points left out, an iteration that did not end."""

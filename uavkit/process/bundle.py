@@ -37,7 +37,7 @@ from uavkit.process.bundle_system import (
     misclosures,
     precision_at,
 )
-from uavkit.process.precision import group_sigma0, interior_covariance, total_redundancy, weighted_square_sum
+from uavkit.process.precision import group_sigma0, interior_covariances, total_redundancy, weighted_square_sum
 from uavkit.process.robust import cut_variance
 
 Values = TypeVar("Values", Array, Flags)
@@ -169,13 +169,18 @@ def _result(system: BundleSystem, state: State, weights: Weights, precision: Pre
     if redundancy <= 0:
         raise AdjustmentError(f"the block has no redundancy ({redundancy:.0f}): sigma0 cannot be told")
     cut = cut_variance(run.options.reject_above) if run.options.robust else 1.0
-    interior = interior_covariance(system, precision)
-    sigmas, prior = np.sqrt(np.diag(interior)), given.interior_sigmas.values()
-    q, n = len(system.free), len(state.centres)
+    interiors = interior_covariances(system, precision)
+    sigmas, prior = np.sqrt(np.einsum("gkk->gk", interiors)).max(axis=0), given.interior_sigmas.values()
+    q = system.shared
     shift_covariance = precision.inverse.corner[q:, q:].reshape(len(state.shifts), 3, len(state.shifts), 3)
     return AdjustmentResult(
-        interior=given.interior.with_parameters(state.interior),
-        interior_covariance=interior,
+        interior=given.interior.with_parameters(state.interior[0]),
+        interior_covariance=interiors[0],
+        interiors=tuple(
+            interior.with_parameters(values)
+            for interior, values in zip(given.interiors or (given.interior,), state.interior, strict=True)
+        ),
+        interior_covariances=interiors,
         undetermined_interior=tuple(
             name
             for name, after, before in zip(INTERIOR_PARAMETERS, sigmas, prior, strict=True)
@@ -183,7 +188,7 @@ def _result(system: BundleSystem, state: State, weights: Weights, precision: Pre
         ),
         projection_centres_m=state.centres,
         R_object_from_image=state.rotations,
-        exterior_covariances=precision.inverse.blocks[system.pattern.diagonal].reshape(n, 6, 6),
+        exterior_covariances=np.ascontiguousarray(precision.inverse.blocks[system.pattern.diagonal, :6, :6]),
         points_m=points,
         point_covariances_m2=precision.point_covariances_m2,
         ray_used=_unsorted(system, used),

@@ -290,7 +290,7 @@ def ray_scales(system: BundleSystem, scales: Array) -> Array:
 def _anchor(system: BundleSystem, state: State, scale: float) -> Anchor:
     """Return the approximate orientations as observations whose sigma suits first misclosures of this scale."""
     sigma_px = ANCHOR * scale * float(np.median(system.rays.sigma_px))
-    c = float(state.interior[0])
+    c = float(np.median(state.interior[:, 0]))
     distance = state.points[system.point_of_ray] - state.centres[system.rays.image]
     distance_m = float(np.nanmedian(np.linalg.norm(distance, axis=1)))
     return Anchor(

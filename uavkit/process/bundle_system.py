@@ -14,7 +14,7 @@ from uavkit.core.angles import rotation_from_vector, skew
 from uavkit.core.arrays import Array, Flags, Indices
 from uavkit.core.errors import AdjustmentError
 from uavkit.process.kernels import bundle_normals as kernels
-from uavkit.process.kernels.bundle_normals import Coordinates, RayTable, Reduced, Unknowns
+from uavkit.process.kernels.bundle_normals import Coordinates, Free, RayTable, Reduced, Unknowns
 from uavkit.process.kernels.bundle_precision import Inverse, fixed_leverage, point_precision
 from uavkit.process.normal_equations import (
     Factoriser,
@@ -25,16 +25,16 @@ from uavkit.process.normal_equations import (
     factor_dense,
     pattern_of_rays,
 )
+from uavkit.process.sparse_factor import choose_factoriser
 
 CHUNKS = 4
 """Parts into which points are shared among threads, whatever the number of processors: sums keep their order."""
 SMALL = 2000
 """Blocks of fewer rays are not worth a thread."""
-BEHIND_CAMERA = 1e3
-"""Misclosure, in sigma, that the cost counts for a ray whose point is behind its camera."""
-
 SINGULAR_DAMPING = 1e-5
 """Up to this, damping carries an iteration past a state of singular equations; at its end they must not be singular."""
+
+NONE_FREE = Free(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
 
 T = TypeVar("T")
 
@@ -44,6 +44,9 @@ class State:
     """Values of all unknowns."""
 
     interior: Array
+    """(g, 10) of each interior orientation."""
+    camera: Indices
+    """(n,) row of each image's interior orientation."""
     centres: Array
     rotations: Array
     points: Array
@@ -52,7 +55,7 @@ class State:
     @property
     def unknowns(self) -> Unknowns:
         """Return the part that kernels know."""
-        return Unknowns(self.interior, self.centres, self.rotations, self.points)
+        return Unknowns(self.interior, self.centres, self.rotations, self.points, self.camera)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,20 +110,42 @@ class BundleSystem:
     """(k,) row in the input of each sorted ray."""
     point_of_ray: Indices
     pattern: Pattern
-    free: Indices
-    """(q,) free parameters of the interior orientation."""
+    parameters: Indices
+    """(q,) free parameters of each interior orientation."""
+    interior: Array
+    """(g, 10) approximate interior orientations."""
+    camera: Indices
+    """(n,) row of each image's interior orientation."""
     prior: Array
-    """(q,) their a priori values."""
+    """(g, q) a priori values of the free parameters."""
     prior_sigma: Array
+    """(q,)."""
     shift_sigma_m: Array
     """(flights, 3) a priori sigma; infinite where free."""
     factorise: Factoriser = factor_dense
     anchor: Anchor | None = None
 
     @property
+    def free(self) -> Free:
+        """Return the free parameters: each image's own where no two share an interior orientation, else shared."""
+        none = np.zeros(0, dtype=np.int64)
+        own = 1 < len(self.interior) == len(self.camera)
+        return Free(self.parameters, none) if own else Free(none, self.parameters)
+
+    @property
+    def image_unknowns(self) -> int:
+        """Return the number d of unknowns of an image: its orientation, and its own interior orientation."""
+        return 6 + len(self.free.own)
+
+    @property
+    def shared(self) -> int:
+        """Return the number of border unknowns that belong to interior orientations; GNSS shifts follow them."""
+        return len(self.free.shared) * len(self.interior)
+
+    @property
     def border(self) -> int:
         """Return the number of border unknowns."""
-        return len(self.free) + self.shift_sigma_m.size
+        return self.shared + self.shift_sigma_m.size
 
     @property
     def uses_gnss(self) -> bool:
@@ -136,7 +161,8 @@ class BundleSystem:
         """Return the approximate values."""
         given = self.given
         return State(
-            interior=given.interior.parameters(),
+            interior=self.interior.copy(),
+            camera=self.camera,
             centres=np.array(given.projection_centres_m, dtype=np.float64),
             rotations=np.array(given.R_object_from_image, dtype=np.float64),
             points=np.array(given.points_m, dtype=np.float64),
@@ -164,7 +190,10 @@ def build_system(
     start = np.searchsorted(point, np.arange(points + 1)).astype(np.int64)
     image = rays.image_index[order].astype(np.int64)
     sigmas = given.interior_sigmas.values()
-    free = np.flatnonzero(sigmas > 0.0).astype(np.int64)
+    parameters = np.flatnonzero(sigmas > 0.0).astype(np.int64)
+    interior, prior = _interiors(given)
+    camera = np.zeros(images, dtype=np.int64) if given.interior_index is None else given.interior_index
+    pattern = pattern_of_rays(image, start, images)
     return BundleSystem(
         given=given,
         datum=datum,
@@ -176,12 +205,23 @@ def build_system(
         ),
         order=order,
         point_of_ray=point,
-        pattern=pattern_of_rays(image, start, images),
-        free=free,
-        prior=(given.interior_prior or given.interior).parameters()[free],
-        prior_sigma=sigmas[free],
+        pattern=pattern,
+        parameters=parameters,
+        interior=interior,
+        camera=np.asarray(camera, dtype=np.int64),
+        prior=prior[:, parameters],
+        prior_sigma=sigmas[parameters],
         shift_sigma_m=_shift_sigmas(given, datum, default_shift_sigma_m),
+        factorise=choose_factoriser(pattern, given.projection_centres_m),
     )
+
+
+def _interiors(given: AdjustmentInput) -> tuple[Array, Array]:
+    """Return approximate and a priori parameters (g, 10) of the interior orientations."""
+    if given.interiors:
+        values = np.array([interior.parameters() for interior in given.interiors])
+        return values, values
+    return given.interior.parameters()[None], (given.interior_prior or given.interior).parameters()[None]
 
 
 def _shift_sigmas(given: AdjustmentInput, datum: Datum, default: tuple[float, float, float]) -> Array:
@@ -237,21 +277,27 @@ def _control(system: BundleSystem, state: State) -> Array:
 
 def cost(system: BundleSystem, state: State, weights: Weights, determined: Flags) -> float:
     """Return the weighted sum of squared misclosures, the a priori ones included."""
-    found = misclosures(system, state)
-    z = np.nan_to_num(found.rays_px / system.rays.sigma_px, nan=BEHIND_CAMERA)
-    total = float(np.sum((weights.rays * determined[system.point_of_ray])[:, None] * z * z))
+
+    def work(first: int, last: int) -> float:
+        return kernels.weighted_squares(system.rays, state.unknowns, weights.rays, determined, first, last)
+
+    total = float(sum(in_chunks(system, work)))
     if system.given.gnss is not None:
-        total += float(np.sum(weights.gnss[:, None] * (found.gnss_m / system.given.gnss.sigma_m) ** 2))
+        misclosure = _gnss_misclosures(system, state) / system.given.gnss.sigma_m
+        total += float(np.sum(weights.gnss[:, None] * misclosure**2))
     if system.given.control is not None:
-        total += float(np.sum(weights.control[:, None] * (found.control_m / system.given.control.sigma_m) ** 2))
-    total += float(np.sum(((state.interior[system.free] - system.prior) / system.prior_sigma) ** 2))
+        misclosure = _control(system, state) / system.given.control.sigma_m
+        total += float(np.sum(weights.control[:, None] * misclosure**2))
+    total += float(np.sum(((state.interior[:, system.parameters] - system.prior) / system.prior_sigma) ** 2))
     if system.anchor is not None:
         total += float(np.sum(system.anchor.misclosures(state) ** 2))
     return total + float(np.sum((state.shifts / system.shift_sigma_m) ** 2))
 
 
 def control_coordinates(system: BundleSystem, state: State, weights: Weights) -> Coordinates:
-    """Return the normal equations of control points as observed object points."""
+    """Return the normal equations of control points as observed object points; none where none takes part."""
+    if not system.uses_control:
+        return Coordinates(np.zeros((0, 3, 3)), np.zeros((0, 3)))
     normal, right = np.zeros((len(state.points), 3, 3)), np.zeros((len(state.points), 3))
     if system.given.control is not None:
         control = system.given.control
@@ -271,12 +317,12 @@ def _add_gnss(system: BundleSystem, state: State, weights: Weights, reduced: Red
     misclosure = _gnss_misclosures(system, state)
     weighted = by_image * p[:, :, None]
     normal = np.einsum("gak,gam->gkm", weighted, by_image)
-    np.add.at(reduced.blocks, system.pattern.diagonal[i], normal)
-    np.add.at(reduced.diagonal_images, i, np.einsum("gkk->gk", normal))
-    np.add.at(reduced.right_images, i, np.einsum("gak,ga->gk", weighted, misclosure))
-    by_flight = reduced.border.transpose(0, 2, 1)
+    np.add.at(reduced.blocks[:, :6, :6], system.pattern.diagonal[i], normal)
+    np.add.at(reduced.diagonal_images[:, :6], i, np.einsum("gkk->gk", normal))
+    np.add.at(reduced.right_images[:, :6], i, np.einsum("gak,ga->gk", weighted, misclosure))
+    by_flight = reduced.border[:, :6].transpose(0, 2, 1)
     for axis in range(3):
-        column = len(system.free) + 3 * gnss.flight + axis
+        column = system.shared + 3 * gnss.flight + axis
         np.add.at(by_flight, (i, column), weighted[:, axis])
         np.add.at(reduced.corner, (column, column), p[:, axis])
         np.add.at(reduced.diagonal_border, column, p[:, axis])
@@ -293,32 +339,54 @@ def gnss_design(system: BundleSystem, state: State) -> Array:
 
 def _add_priors(system: BundleSystem, state: State, reduced: Reduced) -> None:
     """Add a priori observations of interior orientation and GNSS shifts."""
-    sigma = np.concatenate([system.prior_sigma, system.shift_sigma_m.ravel()])
-    value = np.concatenate([state.interior[system.free] - system.prior, state.shifts.ravel()])
-    reduced.corner[np.diag_indices_from(reduced.corner)] += sigma**-2.0
-    reduced.diagonal_border[:] += sigma**-2.0
-    reduced.right_border[:] -= value * sigma**-2.0
+    information, value = border_priors(system, state)
+    reduced.corner[np.diag_indices_from(reduced.corner)] += information
+    reduced.diagonal_border[:] += information
+    reduced.right_border[:] -= value * information
+    if len(system.free.own):
+        own = system.prior_sigma**-2.0
+        reduced.blocks[system.pattern.diagonal, 6:, 6:] += np.diag(own)
+        reduced.diagonal_images[:, 6:] += own
+        reduced.right_images[:, 6:] -= own * (state.interior[:, system.parameters] - system.prior)[system.camera]
     if system.anchor is not None:
         information = system.anchor.information()
-        reduced.blocks[system.pattern.diagonal] += np.diag(information)
-        reduced.diagonal_images[:] += information
-        reduced.right_images[:] += np.sqrt(information) * system.anchor.misclosures(state)
+        reduced.blocks[system.pattern.diagonal, :6, :6] += np.diag(information)
+        reduced.diagonal_images[:, :6] += information
+        reduced.right_images[:, :6] += np.sqrt(information) * system.anchor.misclosures(state)
+
+
+def border_priors(system: BundleSystem, state: State) -> tuple[Array, Array]:
+    """Return a priori weights of the border unknowns and how far each is from its a priori value, (b,)."""
+    shared = len(system.interior) if len(system.free.shared) else 0
+    sigma = np.concatenate([np.tile(system.prior_sigma, shared), system.shift_sigma_m.ravel()])
+    value = (state.interior[:, system.parameters] - system.prior)[:shared].ravel()
+    return sigma**-2.0, np.concatenate([value, state.shifts.ravel()])
 
 
 def reduced_normals(system: BundleSystem, state: State, weights: Weights, damping: float) -> tuple[Reduced, Flags]:
     """Return the reduced normal equations at a state, and which points (m,) their observations determine."""
     coordinates = control_coordinates(system, state, weights)
     determined = np.zeros(len(state.points), dtype=np.bool_)
-    q = len(system.free)
+    q, d, pairs = system.shared, system.image_unknowns, system.pattern.pairs
 
     def work(first: int, last: int) -> Reduced:
-        part = empty_reduced(system.pattern, q)
+        part = empty_reduced(system.pattern, q, d)
         kernels.accumulate(
-            system.rays, state.unknowns, weights.rays, system.free, coordinates, damping, first, last, part, determined
+            system.rays,
+            state.unknowns,
+            weights.rays,
+            system.free,
+            coordinates,
+            damping,
+            first,
+            last,
+            pairs,
+            part,
+            determined,
         )
         return part
 
-    total = empty_reduced(system.pattern, system.border)
+    total = empty_reduced(system.pattern, system.border, d)
     for part in in_chunks(system, work):
         for name in ("blocks", "right_images", "diagonal_images"):
             getattr(total, name).__iadd__(getattr(part, name))
@@ -338,17 +406,17 @@ def inner_datum(system: BundleSystem, state: State) -> InnerDatum | None:
     """
     if system.datum is not Datum.FREE_NETWORK:
         return None
-    n = len(state.centres)
+    n, d = len(state.centres), system.image_unknowns
     local = state.centres - np.mean(state.centres, axis=0)
-    space = np.zeros((6 * n + system.border, 7))
-    images = space[: 6 * n].reshape(n, 6, 7)
+    space = np.zeros((d * n + system.border, 7))
+    images = space[: d * n].reshape(n, d, 7)
     images[:, :3, :3] = np.eye(3)
     images[:, :3, 3:6] = -skew(local)
-    images[:, 3:, 3:6] = state.rotations.transpose(0, 2, 1)
+    images[:, 3:6, 3:6] = state.rotations.transpose(0, 2, 1)
     images[:, :3, 6] = local
     distance_m = float(np.median(np.linalg.norm(state.points - np.mean(state.centres, axis=0), axis=1)))
     weight = np.zeros(len(space))
-    weight[: 6 * n] = np.tile([1.0, 1.0, 1.0, distance_m**2, distance_m**2, distance_m**2], n)
+    weight[: d * n].reshape(n, d)[:, :6] = np.repeat([1.0, distance_m**2], 3)
     _, triangle = np.linalg.qr(np.sqrt(weight)[:, None] * space)
     return InnerDatum(null_space=np.asarray(np.linalg.solve(triangle.T, space.T).T), weight=weight)
 
@@ -408,8 +476,8 @@ def _solve(
 ) -> Change:
     """Return the solution of the normal equations."""
     step = factor.solve(np.concatenate([reduced.right_images.ravel(), reduced.right_border]))
-    n = len(state.centres)
-    images, border = np.ascontiguousarray(step[: 6 * n].reshape(n, 6)), np.ascontiguousarray(step[6 * n :])
+    n, d = len(state.centres), system.image_unknowns
+    images, border = np.ascontiguousarray(step[: d * n].reshape(n, d)), np.ascontiguousarray(step[d * n :])
     coordinates, points = control_coordinates(system, state, weights), np.zeros_like(state.points)
 
     def work(first: int, last: int) -> float:
@@ -433,12 +501,16 @@ def _solve(
 
 def moved(system: BundleSystem, state: State, change: Change, share: float) -> State:
     """Return a state moved by a share of a change."""
-    q, interior = len(system.free), state.interior.copy()
-    interior[system.free] += share * change.border[:q]
+    q, interior = system.shared, state.interior.copy()
+    if q:
+        interior[:, system.parameters] += share * change.border[:q].reshape(len(interior), -1)
+    if len(system.free.own):
+        interior[np.ix_(system.camera, system.parameters)] += share * change.images[:, 6:]
     return State(
         interior=interior,
+        camera=state.camera,
         centres=state.centres + share * change.images[:, :3],
-        rotations=state.rotations @ rotation_from_vector(share * change.images[:, 3:]),
+        rotations=state.rotations @ rotation_from_vector(share * change.images[:, 3:6]),
         points=state.points + share * change.points,
         shifts=state.shifts + share * change.border[q:].reshape(-1, 3),
     )
@@ -446,15 +518,17 @@ def moved(system: BundleSystem, state: State, change: Change, share: float) -> S
 
 def _direct_product(system: BundleSystem, state: State, weights: Weights, images: Array, border: Array) -> float:
     """Return the part of step . right-hand side that GNSS and a priori observations make."""
-    q = len(system.free)
-    sigma = np.concatenate([system.prior_sigma, system.shift_sigma_m.ravel()])
-    value = np.concatenate([state.interior[system.free] - system.prior, state.shifts.ravel()])
-    total = -float(np.sum(border * value * sigma**-2.0))
+    q = system.shared
+    information, value = border_priors(system, state)
+    total = -float(np.sum(border * value * information))
+    if len(system.free.own):
+        off = (state.interior[:, system.parameters] - system.prior)[system.camera]
+        total -= float(np.sum(images[:, 6:] * off * system.prior_sigma**-2.0))
     if system.anchor is not None:
-        total += float(np.sum(images * np.sqrt(system.anchor.information()) * system.anchor.misclosures(state)))
+        total += float(np.sum(images[:, :6] * np.sqrt(system.anchor.information()) * system.anchor.misclosures(state)))
     if system.uses_gnss and system.given.gnss is not None:
         gnss = system.given.gnss
-        moved = np.einsum("gak,gk->ga", gnss_design(system, state), images[gnss.image_index])
+        moved = np.einsum("gak,gk->ga", gnss_design(system, state), images[gnss.image_index, :6])
         moved += border[q:].reshape(-1, 3)[gnss.flight]
         p = weights.gnss[:, None] / gnss.sigma_m**2
         total += float(np.sum(p * moved * _gnss_misclosures(system, state)))
@@ -482,6 +556,7 @@ def precision_at(system: BundleSystem, state: State, weights: Weights) -> Precis
     inverse = factor.inverse()
     coordinates = control_coordinates(system, state, weights)
     covariances, leverage = np.empty((len(state.points), 3, 3)), np.empty((len(system.order), 2))
+    pairs = system.pattern.pairs
 
     def work(first: int, last: int) -> None:
         point_precision(
@@ -492,6 +567,7 @@ def precision_at(system: BundleSystem, state: State, weights: Weights) -> Precis
             coordinates,
             first,
             last,
+            pairs,
             inverse,
             covariances,
             leverage,
@@ -515,7 +591,9 @@ def local_leverage(system: BundleSystem, state: State, weights: Weights) -> tupl
     covariances, leverage = np.empty((len(state.points), 3, 3)), np.empty((len(system.order), 2))
 
     def work(first: int, last: int) -> None:
-        fixed_leverage(system.rays, state.unknowns, weights.rays, coordinates, first, last, covariances, leverage)
+        fixed_leverage(
+            system.rays, state.unknowns, weights.rays, NONE_FREE, coordinates, first, last, covariances, leverage
+        )
 
     list(in_chunks(system, work))
     gnss = 0 if system.given.gnss is None else len(system.given.gnss)
@@ -527,11 +605,11 @@ def _gnss_leverage(system: BundleSystem, state: State, inverse: Inverse) -> Arra
     if gnss is None or not system.uses_gnss:
         return np.zeros((0 if gnss is None else len(gnss), 3))
     i, design = gnss.image_index, gnss_design(system, state)
-    blocks = inverse.blocks[system.pattern.diagonal[i]]
+    blocks = inverse.blocks[system.pattern.diagonal[i], :6, :6]
     variance = np.einsum("gak,gkm,gam->ga", design, blocks, design)
     for axis in range(3):
-        column = len(system.free) + 3 * gnss.flight + axis
-        variance[:, axis] += 2.0 * np.einsum("gk,gk->g", design[:, axis], inverse.border[i, :, column])
+        column = system.shared + 3 * gnss.flight + axis
+        variance[:, axis] += 2.0 * np.einsum("gk,gk->g", design[:, axis], inverse.border[i, :6, column])
         variance[:, axis] += inverse.corner[column, column]
     return np.asarray(variance / gnss.sigma_m**2)
 
@@ -550,13 +628,12 @@ def joint_covariance(
 
     C_ab = delta_ab N_a^-1 + N_a^-1 W_a' Q W_b N_b^-1, with W the mixed part of image and border against the point.
     """
-    n, size = len(state.centres), 6 * len(state.centres) + system.border
-    coordinates = control_coordinates(system, state, weights)
+    size = system.image_unknowns * len(state.centres) + system.border
+    coordinates, rows = control_coordinates(system, state, weights), size - system.border + system.shared
     mixed, own = np.zeros((size, 3 * len(points))), np.zeros((3 * len(points), 3 * len(points)))
     for k, p in enumerate(points):
         part, inverse = kernels_point_parts(system, state, weights, coordinates, int(p))
-        mixed[: 6 * n, 3 * k : 3 * k + 3] = part[: 6 * n]
-        mixed[6 * n : 6 * n + len(system.free), 3 * k : 3 * k + 3] = part[6 * n :]
+        mixed[:rows, 3 * k : 3 * k + 3] = part
         own[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = inverse
     carried = mixed @ np.nan_to_num(own)
     result = own + carried.T @ factor.solve(carried)
@@ -569,20 +646,15 @@ def joint_covariance(
 def kernels_point_parts(
     system: BundleSystem, state: State, weights: Weights, coordinates: Coordinates, point: int
 ) -> tuple[Array, Array]:
-    """Return the mixed part (6 n + q, 3) and inverse normal matrix (3, 3; NaN if undetermined) of one point."""
-    n, q = len(state.centres), len(system.free)
-    most = max(int(system.rays.start[point + 1] - system.rays.start[point]), 1)
-    by_image, by_border, by_point = np.empty((most, 2, 6)), np.empty((most, 2, q)), np.empty((most, 2, 3))
-    misclosure, row = np.empty((most, 2)), np.empty(most, dtype=np.int64)
-    count = kernels.linearise_point(
-        system.rays, state.unknowns, weights.rays, system.free, point, by_image, by_border, by_point, misclosure, row
-    )
-    inverse, gradient = np.full((3, 3), np.nan), np.empty(3)
-    mixed = np.zeros((6 * n + q, 3))
-    if not kernels.eliminate_point(coordinates, point, 0.0, count, by_point, misclosure, inverse, gradient):
+    """Return the mixed part (d n + q, 3) and inverse normal matrix (3, 3; NaN if undetermined) of one point."""
+    n, d, q = len(state.centres), system.image_unknowns, system.shared
+    mixed = np.zeros((d * n + q, 3))
+    equations = kernels.empty_equations(system.rays, state.unknowns, system.free, point, point + 1)
+    count = kernels.linearise_point(system.rays, state.unknowns, weights.rays, system.free, point, equations)
+    if not kernels.eliminate_point(coordinates, point, 0.0, count, equations):
         return mixed, np.full((3, 3), np.nan)
     for a in range(count):
-        i = 6 * int(system.rays.image[row[a]])
-        mixed[i : i + 6] += by_image[a].T @ by_point[a]
-        mixed[6 * n :] += by_border[a].T @ by_point[a]
-    return mixed, inverse
+        i = d * int(system.rays.image[equations.row[a]])
+        mixed[i : i + d] += equations.by_image[a].T @ equations.by_point[a]
+        mixed[d * n :] += equations.by_border[a].T @ equations.by_point[a]
+    return mixed, equations.inverse

@@ -83,10 +83,11 @@ def intersect_points(
     """
     table, order = _table(rays, points)
     unknowns = Unknowns(
-        orientations.interior.parameters(),
+        orientations.interior.parameters()[None],
         np.ascontiguousarray(orientations.projection_centres_m, dtype=np.float64),
         np.ascontiguousarray(orientations.R_object_from_image, dtype=np.float64),
         np.full((points, 3), np.nan),
+        np.zeros(len(orientations.projection_centres_m), dtype=np.int64),
     )
     intersect_robustly(
         table, unknowns, np.ones(points, dtype=np.bool_), np.full(points, scale), 0, points, unknowns.points

@@ -13,8 +13,10 @@ from scipy import linalg
 
 from uavkit.core.arrays import Array, Indices
 from uavkit.core.errors import AdjustmentError
+from uavkit.process.blas_threads import one_blas_thread
 from uavkit.process.kernels import bundle_factor
-from uavkit.process.kernels.bundle_normals import Reduced
+from uavkit.process.kernels import bundle_normals as kernels
+from uavkit.process.kernels.bundle_normals import PairTable, Reduced
 from uavkit.process.kernels.bundle_precision import Inverse
 
 LEAST_EIGENVALUE = 2e-14
@@ -31,6 +33,8 @@ class Pattern:
     """(n + 1,)."""
     column: Indices
     """(pairs,) ascending in each row."""
+    pairs: PairTable
+    """Where the block of two images is."""
 
     @property
     def row(self) -> Indices:
@@ -44,31 +48,34 @@ class Pattern:
 
 
 def pattern_of_rays(image: Indices, point_start: Indices, images: int) -> Pattern:
-    """Return the pairs of images that see a point in common; rays in the order of points, ``point_start`` (m + 1,)."""
-    lengths = np.diff(point_start)
-    keys = [np.arange(images, dtype=np.int64) * (images + 1)]
-    for length in np.unique(lengths[lengths > 1]):
-        rows = point_start[:-1][lengths == length]
-        seen = image[rows[:, None] + np.arange(length)]
-        first, second = (seen[:, index] for index in np.tril_indices(int(length), -1))
-        keys.append(np.unique(np.maximum(first, second) * images + np.minimum(first, second)))
-    pairs = np.unique(np.concatenate(keys))
-    row_start = np.searchsorted(pairs, np.arange(images + 1, dtype=np.int64) * images)
-    return Pattern(row_start=row_start.astype(np.int64), column=pairs % images)
+    """Return the pairs of images that see a point in common.
+
+    Rays in the order of points, ``point_start`` (m + 1,), the images of a point ascending.
+    """
+    first = np.arange(images, dtype=np.int64)
+    kernels.mark_first_partners(point_start, image, first)
+    widths = np.arange(images, dtype=np.int64) - first + 1
+    base = np.cumsum(widths) - widths - first
+    pairs = PairTable(base, first, np.zeros(int(np.sum(widths)), dtype=np.int32))
+    kernels.mark_pairs(point_start, image, base, pairs.place)
+    row_start = np.zeros(images + 1, dtype=np.int64)
+    column = np.empty(kernels.number_pairs(pairs, row_start), dtype=np.int64)
+    kernels.list_columns(pairs, column)
+    return Pattern(row_start=row_start, column=column, pairs=pairs)
 
 
-def empty_reduced(pattern: Pattern, border: int) -> Reduced:
-    """Return reduced normal equations of zeros with so many border unknowns."""
-    n = len(pattern.row_start) - 1
+def empty_reduced(pattern: Pattern, border: int, image_unknowns: int = 6) -> Reduced:
+    """Return reduced normal equations of zeros with so many unknowns of the border and of each image."""
+    n, d = len(pattern.row_start) - 1, image_unknowns
     return Reduced(
         row_start=pattern.row_start,
         column=pattern.column,
-        blocks=np.zeros((len(pattern.column), 6, 6)),
-        border=np.zeros((n, 6, border)),
+        blocks=np.zeros((len(pattern.column), d, d)),
+        border=np.zeros((n, d, border)),
         corner=np.zeros((border, border)),
-        right_images=np.zeros((n, 6)),
+        right_images=np.zeros((n, d)),
         right_border=np.zeros(border),
-        diagonal_images=np.zeros((n, 6)),
+        diagonal_images=np.zeros((n, d)),
         diagonal_border=np.zeros(border),
     )
 
@@ -108,16 +115,16 @@ class Factoriser(Protocol):
 
 def dense_matrix(reduced: Reduced) -> Array:
     """Return the reduced normal matrix (u, u)."""
-    n, b = reduced.border.shape[0], reduced.border.shape[2]
+    n, d, b = reduced.border.shape
     row = np.repeat(np.arange(n), np.diff(reduced.row_start))
-    images = np.zeros((n, n, 6, 6))
+    images = np.zeros((n, n, d, d))
     images[reduced.column, row] = reduced.blocks.transpose(0, 2, 1)
     images[row, reduced.column] = reduced.blocks
-    matrix = np.empty((6 * n + b, 6 * n + b))
-    matrix[: 6 * n, : 6 * n] = images.transpose(0, 2, 1, 3).reshape(6 * n, 6 * n)
-    matrix[: 6 * n, 6 * n :] = reduced.border.reshape(6 * n, b)
-    matrix[6 * n :, : 6 * n] = reduced.border.reshape(6 * n, b).T
-    matrix[6 * n :, 6 * n :] = reduced.corner
+    matrix, u = np.empty((d * n + b, d * n + b)), d * n
+    matrix[:u, :u] = images.transpose(0, 2, 1, 3).reshape(u, u)
+    matrix[:u, u:] = reduced.border.reshape(u, b)
+    matrix[u:, :u] = reduced.border.reshape(u, b).T
+    matrix[u:, u:] = reduced.corner
     return matrix
 
 
@@ -140,32 +147,31 @@ class DenseFactor:
 
     def inverse(self) -> Inverse:
         """Return the inverse at the pattern of the blocks."""
-        reduced, n = self.reduced, len(self.reduced.border)
+        reduced, (n, d, _) = self.reduced, self.reduced.border.shape
         full = invert_factored(self.cholesky)
         full *= self.scale * self.scale[:, None]
         full -= self.null_space @ self.null_space.T
         row = np.repeat(np.arange(n), np.diff(reduced.row_start))
-        images = full[: 6 * n, : 6 * n].reshape(n, 6, n, 6).transpose(0, 2, 1, 3)
+        images = full[: d * n, : d * n].reshape(n, d, n, d).transpose(0, 2, 1, 3)
         return Inverse(
             row_start=reduced.row_start,
             column=reduced.column,
             blocks=np.ascontiguousarray(images[row, reduced.column]),
-            border=np.ascontiguousarray(full[: 6 * n, 6 * n :].reshape(n, 6, -1)),
-            corner=np.ascontiguousarray(full[6 * n :, 6 * n :]),
+            border=np.ascontiguousarray(full[: d * n, d * n :].reshape(n, d, -1)),
+            corner=np.ascontiguousarray(full[d * n :, d * n :]),
         )
 
 
 def factor_dense(reduced: Reduced, damping: float, datum: "InnerDatum | None") -> ReducedFactor:
     """Factor the whole matrix by Cholesky's method (LAPACK); a ``Factoriser``."""
-    diagonal = np.concatenate([reduced.diagonal_images.ravel(), reduced.diagonal_border])
-    if np.any(diagonal <= 0.0):
-        raise AdjustmentError(f"{name_unknown(reduced, int(np.argmin(diagonal)))} has no observation")
+    diagonal = check_observed(reduced)
     matrix = dense_matrix(reduced)
     matrix[np.diag_indices_from(matrix)] += damping * diagonal
     free = np.zeros((len(matrix), 0))
     if datum is not None:
         # N + s W E E^T W, where E^T W E = 1, has the inverse N^+ + E E^T / s; s makes the added term as large as N.
-        strength = float(np.median(diagonal[: 6 * len(reduced.border)] / datum.weight[: 6 * len(reduced.border)]))
+        held = datum.weight > 0.0
+        strength = float(np.median(diagonal[held] / datum.weight[held]))
         constraint = np.sqrt(strength) * datum.weight[:, None] * datum.null_space
         matrix += constraint @ constraint.T
         free = datum.null_space / np.sqrt(strength)
@@ -177,6 +183,15 @@ def factor_dense(reduced: Reduced, damping: float, datum: "InnerDatum | None") -
     return DenseFactor(reduced=reduced, cholesky=cholesky, scale=scale, null_space=free)
 
 
+def check_observed(reduced: Reduced) -> Array:
+    """Return the diagonal (u,) before points were eliminated; raise AdjustmentError where an unknown has none."""
+    diagonal = np.concatenate([reduced.diagonal_images.ravel(), reduced.diagonal_border])
+    if np.any(diagonal <= 0.0):
+        raise AdjustmentError(f"{name_unknown(reduced, int(np.argmin(diagonal)))} has no observation")
+    return diagonal
+
+
+@one_blas_thread()
 def cholesky_factor(matrix: Array) -> tuple[Array, bool]:
     """Return the lower Cholesky factor (u, u), and whether the matrix is positive definite."""
     if len(matrix) <= SMALL:
@@ -186,6 +201,7 @@ def cholesky_factor(matrix: Array) -> tuple[Array, bool]:
     return factor, info == 0
 
 
+@one_blas_thread()
 def solve_factored(cholesky: Array, right: Array) -> Array:
     """Return the solution (u, ...) of a right-hand side (u, ...)."""
     if len(cholesky) > SMALL or right.ndim > 1:
@@ -195,6 +211,7 @@ def solve_factored(cholesky: Array, right: Array) -> Array:
     return solution
 
 
+@one_blas_thread()
 def invert_factored(cholesky: Array) -> Array:
     """Return the inverse (u, u) of the matrix that was factored."""
     if len(cholesky) <= SMALL:
@@ -223,20 +240,27 @@ def least_eigenvalue(cholesky: Array) -> float:
 
 def name_unknown(reduced: Reduced, index: int) -> str:
     """Return the name of the unknown in a row of the reduced normal equations."""
-    images = len(reduced.border)
-    if index >= 6 * images:
-        return f"border unknown {index - 6 * images} (free interior orientation, then GNSS shifts)"
-    return f"image {index // 6} ({'projection centre' if index % 6 < 3 else 'rotation'})"
+    images, d, _ = reduced.border.shape
+    if index >= d * images:
+        return f"border unknown {index - d * images} (free interior orientation, then GNSS shifts)"
+    kind = ("projection centre", "rotation")[index % d // 3] if index % d < 6 else "interior orientation"
+    return f"image {index // d} ({kind})"
 
 
 def describe_defect(reduced: Reduced, scaled_matrix: Array) -> str:
     """Say which unknowns singular normal equations (scaled to unit diagonal) leave open."""
     if not np.all(np.isfinite(scaled_matrix)):
-        return "the normal equations are not finite: an approximate value is far from the truth"
+        return name_defect(reduced, np.full(len(scaled_matrix), np.nan), 1)
     values, vectors = np.linalg.eigh(scaled_matrix)
     open_ = vectors[:, values < 1e-11]
-    defect = max(open_.shape[1], 1)
     share = np.sum(open_**2, axis=1) if open_.size else vectors[:, 0] ** 2
+    return name_defect(reduced, share, max(open_.shape[1], 1))
+
+
+def name_defect(reduced: Reduced, share: Array, defect: int) -> str:
+    """Say which unknowns are open, by their share (u,) in the undetermined directions; NaN: nothing is finite."""
+    if not np.all(np.isfinite(share)):
+        return "the normal equations are not finite: an approximate value is far from the truth"
     worst = np.argsort(share)[::-1][:3]
     names = ", ".join(dict.fromkeys(name_unknown(reduced, int(index)) for index in worst))
     return (

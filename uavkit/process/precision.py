@@ -16,23 +16,31 @@ def total_redundancy(system: BundleSystem, weights: Weights, determined: Flags) 
     """Return the number of observations that take part (weights 0 or 1) less that of the unknowns."""
     used = 2.0 * float(np.sum(weights.rays * determined[system.point_of_ray]))
     direct = 3.0 * float(np.sum(weights.gnss) + np.sum(weights.control))
-    priors = np.concatenate([system.prior_sigma, system.shift_sigma_m.ravel()])
-    unknowns = 6 * len(system.given.projection_centres_m) + system.border + 3 * int(np.sum(determined))
+    priors = np.concatenate([np.tile(system.prior_sigma, len(system.interior)), system.shift_sigma_m.ravel()])
+    images = system.image_unknowns * len(system.given.projection_centres_m)
+    unknowns = images + system.border + 3 * int(np.sum(determined))
     if system.datum is Datum.FREE_NETWORK:
         unknowns -= 7
     return used + direct + float(np.sum(np.isfinite(priors))) - unknowns
 
 
-def interior_covariance(system: BundleSystem, precision: Precision) -> Array:
-    """Return the covariance (10, 10) of the interior orientation; zero where fixed."""
-    covariance, q = np.zeros((10, 10)), len(system.free)
-    covariance[np.ix_(system.free, system.free)] = precision.inverse.corner[:q, :q]
-    return covariance
+def interior_covariances(system: BundleSystem, precision: Precision) -> Array:
+    """Return the covariances (g, 10, 10) of the interior orientations; zero where fixed."""
+    g, q = len(system.interior), len(system.parameters)
+    covariances = np.zeros((g, 10, 10))
+    if len(system.free.own):
+        own = np.empty((g, q, q))
+        own[system.camera] = precision.inverse.blocks[system.pattern.diagonal, 6:, 6:]
+    else:
+        corner = precision.inverse.corner[: g * q, : g * q].reshape(g, q, g, q)
+        own = np.einsum("gkgm->gkm", corner)
+    covariances[np.ix_(np.arange(g), system.parameters, system.parameters)] = own
+    return covariances
 
 
 def group_sigma0(system: BundleSystem, state: State, weights: Weights, precision: Precision) -> dict[str, float]:
     """Return sqrt(sum of squared residuals / sum of redundancy numbers) of each group with redundancy."""
-    found, given, q = misclosures(system, state), system.given, len(system.free)
+    found, given, q = misclosures(system, state), system.given, system.shared
     sums: dict[str, tuple[float, float]] = {}
     used = weights.rays * precision.determined[system.point_of_ray]
     sums["rays"] = _group(found.rays_px / system.rays.sigma_px, used, precision.ray_leverage)
@@ -46,11 +54,12 @@ def group_sigma0(system: BundleSystem, state: State, weights: Weights, precision
     if given.control is not None and system.uses_control:
         z = found.control_m / given.control.sigma_m
         sums["control"] = _group(z, weights.control, precision.control_leverage)
-    if q:
-        z = (state.interior[system.free] - system.prior) / system.prior_sigma
-        variance = np.diag(precision.inverse.corner)[:q]
+    if len(system.parameters):
+        z = (state.interior[:, system.parameters] - system.prior) / system.prior_sigma
+        covariances = interior_covariances(system, precision)
+        variance = covariances[:, system.parameters, system.parameters]
         number = float(np.sum(np.isfinite(system.prior_sigma) - variance / system.prior_sigma**2))
-        sums["interior"] = float(z @ z), number
+        sums["interior"] = float(np.sum(z**2)), number
     return {name: float(np.sqrt(square / number)) for name, (square, number) in sums.items() if number > 1e-3}
 
 

@@ -24,7 +24,7 @@ def squared_misclosures(rays: RayTable, unknowns: Unknowns, first: int, last: in
     for ray in range(first, last):
         i = rays.image[ray]
         out[ray - first] = BEHIND
-        if project(unknowns.interior, unknowns.centres[i], unknowns.rotations[i], point, computed):
+        if project(unknowns.interior[unknowns.camera[i]], unknowns.centres[i], unknowns.rotations[i], point, computed):
             x = (rays.xy_px[ray, 0] - computed[0]) / rays.sigma_px[ray, 0]
             y = (rays.xy_px[ray, 1] - computed[1]) / rays.sigma_px[ray, 1]
             out[ray - first] = x * x + y * y
@@ -71,7 +71,14 @@ def refine(
         for ray in range(first, last):
             i = rays.image[ray]
             if not differentiate(
-                unknowns.interior, unknowns.centres[i], unknowns.rotations[i], point, computed, bp, br, bi
+                unknowns.interior[unknowns.camera[i]],
+                unknowns.centres[i],
+                unknowns.rotations[i],
+                point,
+                computed,
+                bp,
+                br,
+                bi,
             ):
                 continue
             weight = 1.0 / (1.0 + squared[ray - first] / (scale * scale))
@@ -119,7 +126,7 @@ def intersect_robustly(
         for a in range(count):
             i = rays.image[begin + a]
             valid[a] = direction(
-                unknowns.interior,
+                unknowns.interior[unknowns.camera[i]],
                 unknowns.rotations[i],
                 rays.xy_px[begin + a, 0],
                 rays.xy_px[begin + a, 1],
@@ -173,7 +180,14 @@ def adjust_points(
             for ray in range(rays.start[p], rays.start[p + 1]):
                 i = rays.image[ray]
                 if not used[ray] or not differentiate(
-                    unknowns.interior, unknowns.centres[i], unknowns.rotations[i], points[p], computed, bp, br, bi
+                    unknowns.interior[unknowns.camera[i]],
+                    unknowns.centres[i],
+                    unknowns.rotations[i],
+                    points[p],
+                    computed,
+                    bp,
+                    br,
+                    bi,
                 ):
                     continue
                 for axis in range(2):
@@ -201,7 +215,14 @@ def adjust_points(
             i = rays.image[ray]
             leverage[ray] = np.nan
             if differentiate(
-                unknowns.interior, unknowns.centres[i], unknowns.rotations[i], points[p], computed, bp, br, bi
+                unknowns.interior[unknowns.camera[i]],
+                unknowns.centres[i],
+                unknowns.rotations[i],
+                points[p],
+                computed,
+                bp,
+                br,
+                bi,
             ):
                 for axis in range(2):
                     leverage[ray, axis] = np.dot(bp[axis], inverse @ bp[axis]) / rays.sigma_px[ray, axis] ** 2

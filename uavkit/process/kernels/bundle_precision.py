@@ -5,16 +5,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from uavkit.process.kernels.bundle_geometry import differentiate
 from uavkit.process.kernels.bundle_normals import (
     Coordinates,
+    Equations,
+    Free,
+    PairTable,
     RayTable,
     Unknowns,
     eliminate_point,
+    empty_equations,
     linearise_point,
-    pair_row,
 )
-from uavkit.process.kernels.jit import kernel
+from uavkit.process.kernels.bundle_products import add_left_product, add_right_product
+from uavkit.process.kernels.jit import kernel, summing_kernel
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -30,214 +33,244 @@ class Inverse(NamedTuple):
     corner: Array
 
 
-@kernel
+@summing_kernel
 def point_precision(
-    rays: RayTable, unknowns: Unknowns, weight: Array, free: Indices, coordinates: Coordinates, first: int, last: int,
-    inverse: Inverse, covariance: Array, leverage: Array,
+    rays: RayTable, unknowns: Unknowns, weight: Array, free: Free, coordinates: Coordinates, first: int, last: int,
+    pairs: PairTable, inverse: Inverse, covariance: Array, leverage: Array,
 ) -> None:  # fmt: skip
     """Write covariances (m, 3, 3) of points first to last and leverages (k, 2) of all their rays.
 
     Leverage: variance of the adjusted image coordinate over the observation's a priori variance; also of rays of weight
     zero, which are predicted by the others. NaN where the point is not determined. The redundancy number of a ray of
     full weight is 1 - leverage (Foerstner 1987; Kraus, Photogrammetry, vol. 2, app. 4).
+    With N^-1 = root^T root and Y = root (mixed part), the point's covariance is root^T (1 + Y Q Y^T) root, and that
+    with the orientations -root^T Y Q.
     """
-    most, q = 1, len(free)
+    every, used = empty_equations(rays, unknowns, free, first, last), empty_equations(rays, unknowns, free, first, last)
+    most, d, q = used.by_image.shape[0], used.by_image.shape[2], used.by_border.shape[2]
+    ones, of_every = np.ones(len(weight)), np.empty(most, dtype=np.int64)
+    reducer, turned, reducer_border = np.empty((most, 3, d)), np.empty((most, d, 3)), np.empty((3, q))
+    carried, carried_turned, carried_border = np.empty((most, 3, d)), np.empty((most, d, 3)), np.empty((3, q))
+    other, other_turned, with_image, with_border = (
+        np.empty((1, 3, d)), np.empty((1, d, 3)), np.empty((3, d)), np.empty((3, q)),
+    )  # fmt: skip
     for p in range(first, last):
-        most = max(most, rays.start[p + 1] - rays.start[p])
-    by_image, by_border, by_point = np.empty((most, 2, 6)), np.empty((most, 2, q)), np.empty((most, 2, 3))
-    misclosure, row = np.empty((most, 2)), np.empty(most, dtype=np.int64)
-    own, gradient = np.empty((3, 3)), np.empty(3)
-    mixed, mixed_border = np.empty((most, 6, 3)), np.empty((q, 3))
-    with_image, with_border, other_image = np.empty((most, 3, 6)), np.empty((3, q)), np.empty((3, 6))
-    total, reduced, sums, line = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, max(q, 6))), np.empty(9 + q)
-    computed, bp, br, bi = np.empty(2), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 10))
-    variance = np.empty(2)
-    for p in range(first, last):
-        covariance[p] = np.nan
-        for ray in range(rays.start[p], rays.start[p + 1]):
-            leverage[ray] = np.nan
-        count = linearise_point(
-            rays, unknowns, weight, free, p, by_image, by_border, by_point, misclosure, row
-        )  # fmt: skip
-        if not eliminate_point(coordinates, p, 0.0, count, by_point, misclosure, own, gradient):
-            continue
-        mixed_border[:] = 0.0
-        for a in range(count):
-            for m in range(3):
-                for k in range(6):
-                    mixed[a, k, m] = by_image[a, 0, k] * by_point[a, 0, m] + by_image[a, 1, k] * by_point[a, 1, m]
-                for k in range(q):
-                    mixed_border[k, m] += (
-                        by_border[a, 0, k] * by_point[a, 0, m] + by_border[a, 1, k] * by_point[a, 1, m]
-                    )
-        total[:] = own
-        _covariance_with_border(rays, inverse, row, count, mixed, mixed_border, own, sums, with_border)
-        _subtract_carried(with_border, mixed_border, own, reduced, total)
-        for a in range(count):
-            _covariance_with_image(
-                rays, inverse, row, count, mixed, mixed_border, own, rays.image[row[a]], sums, with_image[a]
-            )  # fmt: skip
-            _subtract_carried(with_image[a], mixed[a], own, reduced, total)
         for k in range(3):
             for m in range(3):
-                covariance[p, k, m] = 0.5 * (total[k, m] + total[m, k])
-        used = 0
+                covariance[p, k, m] = np.nan
         for ray in range(rays.start[p], rays.start[p + 1]):
-            i = rays.image[ray]
-            if not differentiate(
-                unknowns.interior, unknowns.centres[i], unknowns.rotations[i], unknowns.points[p], computed, bp, br, bi
-            ):
-                continue
-            if used < count and row[used] == ray:
-                _predict(bp, br, bi, free, covariance[p], with_image[used], with_border, inverse, i, line, variance)
-                used += 1
+            leverage[ray, 0], leverage[ray, 1] = np.nan, np.nan
+        total = linearise_point(rays, unknowns, ones, free, p, every)
+        count = _choose_used(every, total, weight, used, of_every)
+        if not eliminate_point(coordinates, p, 0.0, count, used):
+            continue
+        _reduce(used, count, reducer, turned, reducer_border)
+        for a in range(count):
+            carried[a], carried_turned[a] = 0.0, 0.0
+        for a in range(count):
+            i = rays.image[used.row[a]]
+            for b in range(a + 1):
+                at = pairs.place[pairs.base[i] + rays.image[used.row[b]]]
+                add_left_product(carried, b, turned, a, inverse.blocks, at)
+                if b < a:
+                    add_right_product(carried_turned, a, inverse.blocks, at, turned, b)
+        carried_border[:] = 0.0
+        for a in range(count):
+            i = rays.image[used.row[a]]
+            for r in range(3):
+                for k in range(d):
+                    carried[a, r, k] += carried_turned[a, k, r]
+            _add_with_border(inverse, i, reducer[a], reducer_border, carried[a], carried_border)
+        for r in range(3):
+            for k in range(q):
+                for m in range(q):
+                    carried_border[r, m] += reducer_border[r, k] * inverse.corner[k, m]
+        _write_covariance(used, count, carried, reducer, carried_border, reducer_border, covariance[p])
+        _times_root(used.root, carried_border, with_border)
+        for t in range(total):
+            i = rays.image[every.row[t]]
+            if of_every[t] >= 0:
+                _times_root(used.root, carried[of_every[t]], with_image)
             else:
-                _covariance_with_image(
-                    rays, inverse, row, count, mixed, mixed_border, own, i, sums, other_image
+                _carry_to_other(
+                    rays, pairs, inverse, used, count, i, turned, reducer_border, other, other_turned
                 )  # fmt: skip
-                _predict(bp, br, bi, free, covariance[p], other_image, with_border, inverse, i, line, variance)
+                _times_root(used.root, other[0], with_image)
+            block = inverse.blocks[pairs.place[pairs.base[i] + i]]
             for axis in range(2):
-                leverage[ray, axis] = variance[axis] / rays.sigma_px[ray, axis] ** 2
+                leverage[every.row[t], axis] = _variance(
+                    every.by_point[t, axis], every.by_image[t, axis], every.by_border[t, axis], covariance[p],
+                    with_image, with_border, block, inverse.border[i], inverse.corner,
+                )  # fmt: skip
 
 
-@kernel
+@summing_kernel
 def fixed_leverage(
-    rays: RayTable, unknowns: Unknowns, weight: Array, coordinates: Coordinates, first: int, last: int,
+    rays: RayTable, unknowns: Unknowns, weight: Array, free: Free, coordinates: Coordinates, first: int, last: int,
     covariance: Array, leverage: Array,
 ) -> None:  # fmt: skip
     """Write what ``point_precision`` does, but for orientations known exactly: an inverse of nothing but zeros."""
-    most = 1
+    every, used = empty_equations(rays, unknowns, free, first, last), empty_equations(rays, unknowns, free, first, last)
+    ones, of_every = np.ones(len(weight)), np.empty(len(used.row), dtype=np.int64)
     for p in range(first, last):
-        most = max(most, rays.start[p + 1] - rays.start[p])
-    by_image, by_border, by_point = np.empty((most, 2, 6)), np.empty((most, 2, 0)), np.empty((most, 2, 3))
-    misclosure, row, none = np.empty((most, 2)), np.empty(most, dtype=np.int64), np.empty(0, dtype=np.int64)
-    own, gradient = np.empty((3, 3)), np.empty(3)
-    computed, bp, br, bi = np.empty(2), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 10))
-    for p in range(first, last):
-        covariance[p] = np.nan
+        for k in range(3):
+            for m in range(3):
+                covariance[p, k, m] = np.nan
         for ray in range(rays.start[p], rays.start[p + 1]):
-            leverage[ray] = np.nan
-        count = linearise_point(rays, unknowns, weight, none, p, by_image, by_border, by_point, misclosure, row)
-        if not eliminate_point(coordinates, p, 0.0, count, by_point, misclosure, own, gradient):
+            leverage[ray, 0], leverage[ray, 1] = np.nan, np.nan
+        total = linearise_point(rays, unknowns, ones, free, p, every)
+        count = _choose_used(every, total, weight, used, of_every)
+        if not eliminate_point(coordinates, p, 0.0, count, used):
             continue
-        covariance[p] = own
-        for ray in range(rays.start[p], rays.start[p + 1]):
-            i = rays.image[ray]
-            if not differentiate(
-                unknowns.interior, unknowns.centres[i], unknowns.rotations[i], unknowns.points[p], computed, bp, br, bi
-            ):
-                continue
+        covariance[p] = used.inverse
+        for t in range(total):
             for axis in range(2):
                 variance = 0.0
                 for k in range(3):
                     for m in range(3):
-                        variance += bp[axis, k] * own[k, m] * bp[axis, m]
-                leverage[ray, axis] = variance / rays.sigma_px[ray, axis] ** 2
+                        variance += every.by_point[t, axis, k] * used.inverse[k, m] * every.by_point[t, axis, m]
+                leverage[every.row[t], axis] = variance
 
 
 @kernel
-def _subtract_carried(with_other: Array, mixed: Array, own: Array, carried: Array, total: Array) -> None:
-    """Subtract with_other (3, u) mixed (u, 3) own (3, 3) from total; carried (3, 3) is for scratch."""
-    for k in range(3):
-        for m in range(3):
-            value = 0.0
-            for s in range(len(mixed)):
-                value += with_other[k, s] * mixed[s, m]
-            carried[k, m] = value
-    for k in range(3):
-        for m in range(3):
-            total[k, m] -= carried[k, 0] * own[0, m] + carried[k, 1] * own[1, m] + carried[k, 2] * own[2, m]
+def _choose_used(every: Equations, total: int, weight: Array, used: Equations, of_every: Indices) -> int:
+    """Write equations of weight above zero, weighted, to ``used``, and each's number there or -1; return how many."""
+    count = 0
+    for t in range(total):
+        of_every[t] = -1
+        if not weight[every.row[t]] > 0.0:
+            continue
+        root = np.sqrt(weight[every.row[t]])
+        for axis in range(2):
+            used.misclosure[count, axis] = root * every.misclosure[t, axis]
+            for k in range(3):
+                used.by_point[count, axis, k] = root * every.by_point[t, axis, k]
+            for k in range(every.by_image.shape[2]):
+                used.by_image[count, axis, k] = root * every.by_image[t, axis, k]
+            for k in range(every.by_border.shape[2]):
+                used.by_border[count, axis, k] = root * every.by_border[t, axis, k]
+        used.row[count] = every.row[t]
+        of_every[t] = count
+        count += 1
+    return count
 
 
-@kernel
-def _covariance_with_image(
-    rays: RayTable, inverse: Inverse, row: Indices, count: int, mixed: Array, mixed_border: Array, own: Array,
-    image: int, sums: Array, out: Array,
-) -> None:  # fmt: skip
-    """Write the covariance (3, 6) between a point and the orientation of an image; sums (3, 6 or more) is scratch."""
-    q = len(mixed_border)
-    for s in range(6):
-        s0, s1, s2 = 0.0, 0.0, 0.0
-        for k in range(q):
-            value = inverse.border[image, s, k]
-            s0 += mixed_border[k, 0] * value
-            s1 += mixed_border[k, 1] * value
-            s2 += mixed_border[k, 2] * value
-        sums[0, s], sums[1, s], sums[2, s] = s0, s1, s2
+@summing_kernel
+def _reduce(used: Equations, count: int, reducer: Array, turned: Array, reducer_border: Array) -> None:
+    """Write root (mixed part) of each image (3, d), turned (d, 3), and of the border (3, q)."""
+    reducer_border[:] = 0.0
     for a in range(count):
-        j = rays.image[row[a]]
-        pair = pair_row(inverse.row_start, inverse.column, max(j, image), min(j, image))
-        for s in range(6):
-            s0, s1, s2 = sums[0, s], sums[1, s], sums[2, s]
-            for k in range(6):
-                value = inverse.blocks[pair, k, s] if j >= image else inverse.blocks[pair, s, k]
-                s0 += mixed[a, k, 0] * value
-                s1 += mixed[a, k, 1] * value
-                s2 += mixed[a, k, 2] * value
-            sums[0, s], sums[1, s], sums[2, s] = s0, s1, s2
-    for m in range(3):
-        for s in range(6):
-            out[m, s] = -(own[m, 0] * sums[0, s] + own[m, 1] * sums[1, s] + own[m, 2] * sums[2, s])
+        for r in range(3):
+            s0, s1 = 0.0, 0.0
+            for k in range(r + 1):
+                s0 += used.root[r, k] * used.by_point[a, 0, k]
+                s1 += used.root[r, k] * used.by_point[a, 1, k]
+            for k in range(reducer.shape[2]):
+                value = s0 * used.by_image[a, 0, k] + s1 * used.by_image[a, 1, k]
+                reducer[a, r, k] = value
+                turned[a, k, r] = value
+            for k in range(reducer_border.shape[1]):
+                reducer_border[r, k] += s0 * used.by_border[a, 0, k] + s1 * used.by_border[a, 1, k]
 
 
-@kernel
-def _covariance_with_border(
-    rays: RayTable,
-    inverse: Inverse,
-    row: Indices,
-    count: int,
-    mixed: Array,
-    mixed_border: Array,
-    own: Array,
-    sums: Array,
-    out: Array,
+@summing_kernel
+def _add_with_border(
+    inverse: Inverse, image: int, reducer: Array, reducer_border: Array, carried: Array, carried_border: Array
 ) -> None:
-    """Write the covariance (3, q) between a point and the free interior orientation; sums (3, q or more) is scratch."""
-    q = len(mixed_border)
-    sums[:, :q] = 0.0
-    for a in range(count):
-        j = rays.image[row[a]]
-        for m in range(3):
-            for k in range(6):
-                for s in range(q):
-                    sums[m, s] += mixed[a, k, m] * inverse.border[j, k, s]
-    for k in range(q):
-        for m in range(3):
-            for s in range(q):
-                sums[m, s] += mixed_border[k, m] * inverse.corner[k, s]
-    for m in range(3):
-        for s in range(q):
-            out[m, s] = -(own[m, 0] * sums[0, s] + own[m, 1] * sums[1, s] + own[m, 2] * sums[2, s])
+    """Add the border's part to Y Q of an image (3, d), and the image's part to Y Q of the border (3, q)."""
+    border = inverse.border[image]
+    for r in range(3):
+        for k in range(reducer.shape[1]):
+            total, factor = 0.0, reducer[r, k]
+            for m in range(reducer_border.shape[1]):
+                total += reducer_border[r, m] * border[k, m]
+                carried_border[r, m] += factor * border[k, m]
+            carried[r, k] += total
 
 
-@kernel
-def _predict(
-    by_point: Array, by_rotation: Array, by_interior: Array, free: Indices, covariance: Array, with_image: Array,
-    with_border: Array, inverse: Inverse, image: int, row: Array, out: Array,
+@summing_kernel
+def _carry_to_other(
+    rays: RayTable, pairs: PairTable, inverse: Inverse, used: Equations, count: int, image: int, turned: Array,
+    reducer_border: Array, out: Array, out_turned: Array,
 ) -> None:  # fmt: skip
-    """Write the variances (2,) of a computed image point, in square pixels; row (9 + q,) is scratch."""
-    q, pair = len(free), inverse.row_start[image + 1] - 1
-    for axis in range(2):
-        for k in range(3):
-            row[k] = by_point[axis, k]
-            row[3 + k] = -by_point[axis, k]
-            row[6 + k] = by_rotation[axis, k]
-        for k in range(q):
-            row[9 + k] = by_interior[axis, free[k]]
-        total = 0.0
-        for k in range(3):
-            for m in range(3):
-                total += row[k] * covariance[k, m] * row[m]
-            for m in range(6):
-                total += 2.0 * row[k] * with_image[k, m] * row[3 + m]
-            for m in range(q):
-                total += 2.0 * row[k] * with_border[k, m] * row[9 + m]
-        for k in range(6):
-            for m in range(6):
-                total += row[3 + k] * inverse.blocks[pair, k, m] * row[3 + m]
-            for m in range(q):
-                total += 2.0 * row[3 + k] * inverse.border[image, k, m] * row[9 + m]
-        for k in range(q):
-            for m in range(q):
-                total += row[9 + k] * inverse.corner[k, m] * row[9 + m]
-        out[axis] = total
+    """Write Y Q (3, d) of an image whose own ray of the point has no weight."""
+    out[:], out_turned[:] = 0.0, 0.0
+    for a in range(count):
+        j = rays.image[used.row[a]]
+        if j >= image:
+            add_left_product(out, 0, turned, a, inverse.blocks, pairs.place[pairs.base[j] + image])
+        else:
+            add_right_product(out_turned, 0, inverse.blocks, pairs.place[pairs.base[image] + j], turned, a)
+    for r in range(3):
+        for k in range(out.shape[2]):
+            total = out_turned[0, k, r]
+            for m in range(reducer_border.shape[1]):
+                total += reducer_border[r, m] * inverse.border[image, k, m]
+            out[0, r, k] += total
+
+
+@summing_kernel
+def _write_covariance(
+    used: Equations, count: int, carried: Array, reducer: Array, carried_border: Array, reducer_border: Array,
+    out: Array,
+) -> None:  # fmt: skip
+    """Write root^T (1 + Y Q Y^T) root."""
+    root, middle = used.root, np.empty((3, 3))
+    for r in range(3):
+        for s in range(3):
+            total = 1.0 if r == s else 0.0
+            for a in range(count):
+                for k in range(reducer.shape[2]):
+                    total += carried[a, r, k] * reducer[a, s, k]
+            for k in range(reducer_border.shape[1]):
+                total += carried_border[r, k] * reducer_border[s, k]
+            middle[r, s] = total
+    for k in range(3):
+        for m in range(k + 1):
+            total = 0.0
+            for r in range(k, 3):
+                for s in range(m, 3):
+                    total += root[r, k] * 0.5 * (middle[r, s] + middle[s, r]) * root[s, m]
+            out[k, m], out[m, k] = total, total
+
+
+@summing_kernel
+def _times_root(root: Array, carried: Array, out: Array) -> None:
+    """Write -root^T carried, (3, u): the covariance of a point with other unknowns."""
+    for k in range(carried.shape[1]):
+        c0, c1, c2 = carried[0, k], carried[1, k], carried[2, k]
+        out[0, k] = -(root[0, 0] * c0 + root[1, 0] * c1 + root[2, 0] * c2)
+        out[1, k] = -(root[1, 1] * c1 + root[2, 1] * c2)
+        out[2, k] = -root[2, 2] * c2
+
+
+@summing_kernel
+def _variance(
+    by_point: Array, by_image: Array, by_border: Array, covariance: Array, with_image: Array, with_border: Array,
+    block: Array, border: Array, corner: Array,
+) -> float:  # fmt: skip
+    """Return the variance of a computed image coordinate over that of the observed one."""
+    d, q = len(by_image), len(by_border)
+    total = 0.0
+    for k in range(3):
+        line = 0.0
+        for m in range(3):
+            line += covariance[k, m] * by_point[m]
+        for m in range(d):
+            line += 2.0 * with_image[k, m] * by_image[m]
+        for m in range(q):
+            line += 2.0 * with_border[k, m] * by_border[m]
+        total += by_point[k] * line
+    for k in range(d):
+        line = 0.0
+        for m in range(d):
+            line += block[k, m] * by_image[m]
+        for m in range(q):
+            line += 2.0 * border[k, m] * by_border[m]
+        total += by_image[k] * line
+    for k in range(q):
+        line = 0.0
+        for m in range(q):
+            line += corner[k, m] * by_border[m]
+        total += by_border[k] * line
+    return total
