@@ -25,6 +25,14 @@ from uavkit.project import IngestOptions, Manifest, Original, Project, Stage, St
 
 SIMULATION_LABEL = "simulation.json"
 """Beside simulated stills: which flight they repeat. It holds no truth."""
+AS_IN_THE_PAPER: Mapping[str, Any] = {
+    "terrain": "embankment",
+    "texture": "mixed",
+    "brightness_jump": 0.0,
+    "gnss_sigma_m": 1.0,
+    "control_points": 3,
+}
+"""Options of a simulated flight that is like one of the paper's."""
 DEMO: Mapping[str, Any] = {
     "flight": "trace",
     "scale": 0.25,
@@ -43,6 +51,8 @@ def simulate(out: Path, values: Mapping[str, Any], progress: Progress = silent) 
     options = _simulation_options(values)
     made = simulate_survey(out, options, progress)
     label = {name: values.get(name) for name in ("flight", "scale", "strips", "stations_per_strip")}
+    if any(values.get(name, usual) != usual for name, usual in AS_IN_THE_PAPER.items()):
+        label["flight"] = None  # another site or other positions: the paper has no such flight
     write_text(made.stills / SIMULATION_LABEL, json.dumps(label) + "\n")
     return " ".join(["uavkit ingest SURVEY", *(f"{name} {path}" for name, path in ingest_arguments(made, options))])
 
