@@ -47,9 +47,10 @@ def make_pair(
     contrast: float = 40.0,
     points: int = 300,
     shift: tuple[float, float] = (1.63, -2.28),
+    shortest_px: float = 4.0,
 ) -> Pair:
     rng = np.random.default_rng(seed)
-    texture = wave_texture(rng)
+    texture = wave_texture(rng, shortest_px=shortest_px)
     L = np.eye(2) if matrix is None else matrix
     inverse = np.linalg.inv(L)
     texture_from_target = np.column_stack([inverse, MIDDLE - inverse @ (MIDDLE + shift)])
@@ -77,8 +78,18 @@ def match(
 
 @pytest.mark.parametrize(
     "matrix",
-    [turned(0), turned(10, 1.1, 0.1), turned(-10, 0.9), turned(180), turned(93, 1.0, 0.25)],
-    ids=["shift", "rotated", "smaller", "upside down", "quarter turn"],
+    [
+        turned(0),
+        turned(5),  # resampled in two passes of wide vectors
+        turned(12.5),  # of which the second does half of each vector again
+        turned(20),  # pixel by pixel
+        turned(10, 1.1, 0.1),
+        turned(-10, 0.9),
+        turned(180),
+        turned(174),
+        turned(93, 1.0, 0.25),
+    ],
+    ids=["shift", "turned", "more", "far", "rotated", "smaller", "upside down", "and turned", "quarter turn"],
 )
 def test_position_is_true_to_a_tenth_of_a_pixel(matrix: np.ndarray) -> None:
     pair = make_pair(matrix=matrix)
@@ -93,15 +104,36 @@ def test_position_is_true_to_a_tenth_of_a_pixel(matrix: np.ndarray) -> None:
     assert np.median(result.offset[result.ok]) == pytest.approx(115, abs=6)
 
 
-def test_interpolation_does_not_pull_to_whole_pixels() -> None:
+@pytest.mark.parametrize("shortest_px,most_px", [(4.0, 0.012), (6.5, 0.005)])
+def test_interpolation_does_not_pull_to_whole_pixels(shortest_px: float, most_px: float) -> None:
+    # The phase of Catmull and Rom's interpolation at a quarter of a pixel, weighted by the gradients of these waves, is
+    # off by 0.011 px where they are as short as 4 px, and falls with the square of their frequency.
     biases = []
     for fraction in np.arange(0, 1, 0.125):
-        pair = make_pair(noise=0.0, quality=0, gain=1.0, shift=(2 + fraction, 1 - fraction))
+        pair = make_pair(noise=0.0, quality=0, gain=1.0, shift=(2 + fraction, 1 - fraction), shortest_px=shortest_px)
         whole = replace(pair, reference_px=np.round(pair.reference_px))
         whole = replace(whole, truth_px=whole.reference_px + [2 + fraction, 1 - fraction])
         result = match(whole)
         biases.append((result.target_px - whole.truth_px)[result.ok].mean(axis=0))
-    assert np.abs(biases).max() < 0.02
+    assert np.abs(biases).max() < most_px
+
+
+def test_further_iterations_would_hardly_move_a_point() -> None:
+    pair = make_pair(matrix=turned(8), noise=4.0, contrast=25.0)
+    soon, late = match(pair), match(pair, options=MatchingOptions(convergence_px=0.0005, most_iterations=40))
+    both = soon.ok & late.ok
+    assert both.mean() > 0.95
+    # stated: what remains is below convergence_px; its rate is an estimate, so twice that for all but a few points
+    moved = np.hypot(*(soon.target_px - late.target_px)[both].T)
+    assert np.quantile(moved, 0.95) < 2 * MatchingOptions().convergence_px
+
+
+@pytest.mark.parametrize("window_px", [7, 15, 21, 33, 49])
+def test_windows_of_all_sizes_find_the_same_place(window_px: int) -> None:
+    pair = make_pair(matrix=turned(6), noise=1.0, points=60)
+    result = match(pair, 0.3, MatchingOptions(window_px=window_px))
+    error = np.abs(result.target_px - pair.truth_px).max(axis=1)
+    assert (result.ok & (error < 1.5 / window_px)).mean() > 0.9
 
 
 def test_convergence_from_two_pixels_away() -> None:

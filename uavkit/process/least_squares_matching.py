@@ -23,7 +23,6 @@ Grey = NDArray[np.uint8]
 
 CHUNK = 256
 """Points in one unit of work, whatever the number of workers, so that results do not depend on it."""
-_TABLE_STEPS = 2**least_squares.FRACTION_BITS
 
 
 class MatchingStatus(IntEnum):
@@ -47,10 +46,10 @@ class MatchingOptions:
     weight_sigma: float = 0.5
     """Standard deviation of the Gaussian weights in half windows."""
     most_iterations: int = 15
-    shift_iterations: int = 2
+    shift_iterations: int = 1
     """First iterations that move the window without deforming it: they widen the range of convergence."""
-    convergence_px: float = 0.01
-    """The last change of position; what remains is smaller again by an order of magnitude."""
+    convergence_px: float = 0.004
+    """How far the result may lie from where further iterations would end: the last step times their rate."""
     most_drift_px: float = 4.0
     """Farthest distance from the start before the point counts as diverged."""
     least_gradient: float = 2.0
@@ -119,7 +118,7 @@ def match_least_squares(
     moved_warps = np.array(warps, np.float64)
     results, status = np.full((count, 8), np.nan), np.full(count, MatchingStatus.LEFT_IMAGE, np.int64)
     starts = np.array(reference_px, np.float64)
-    weights, table = _weights(chosen.window_px, chosen.weight_sigma), _cubic_table()
+    fine, coarse = _tables(chosen, 1), _tables(chosen, 2)
     criteria = _criteria(chosen)
     side = _buffer_side(moved_warps, chosen)
     pictures = np.ascontiguousarray(reference), np.ascontiguousarray(target)
@@ -128,14 +127,13 @@ def match_least_squares(
         least_squares.match_patches(
             *pictures,
             starts[rows],
-            weights,
-            table,
+            chosen.window_px,
             criteria,
             positions[rows],
             moved_warps[rows],
             results[rows],
             status[rows],
-            least_squares.workspace(chosen.window_px, side),
+            least_squares.workspace(chosen.window_px, side, fine, coarse),
         )
 
     in_chunks(match, count, workers)
@@ -269,25 +267,13 @@ def _with_status(result: MatchingResult, status: NDArray[np.int64]) -> MatchingR
     return replace(result, status=status)
 
 
+def _tables(options: MatchingOptions, step: int) -> NDArray[np.float32]:
+    return _weight_tables(options.window_px, options.weight_sigma, step)
+
+
 @lru_cache(maxsize=16)
-def _weights(window_px: int, weight_sigma: float) -> NDArray[np.float32]:
-    """Gaussian weights (m, m), 1 in the middle."""
-    offsets = (np.arange(window_px) - window_px // 2) / (window_px // 2)
-    profile = np.exp(-0.5 * (offsets / weight_sigma) ** 2)
-    return np.outer(profile, profile).astype(np.float32)
-
-
-@lru_cache(maxsize=1)
-def _cubic_table() -> NDArray[np.float32]:
-    """Catmull-Rom weights at 1 / 1024 of a pixel, (1025, 4)."""
-    t = np.arange(_TABLE_STEPS + 1) / _TABLE_STEPS
-    columns = [
-        ((2 - t) * t - 1) * t / 2,
-        ((3 * t - 5) * t * t + 2) / 2,
-        ((4 - 3 * t) * t + 1) * t / 2,
-        (t - 1) * t * t / 2,
-    ]
-    return np.stack(columns, axis=1).astype(np.float32)
+def _weight_tables(window_px: int, weight_sigma: float, step: int) -> NDArray[np.float32]:
+    return least_squares.grid_tables(window_px, weight_sigma, step)
 
 
 def _criteria(options: MatchingOptions) -> least_squares.Criteria:
