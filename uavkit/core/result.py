@@ -22,6 +22,8 @@ class PointOrigin(IntEnum):
     """Followed through the video from still to still."""
     FEATURES = 2
     """Feature matching between stills."""
+    FILLING = 3
+    """Chosen in the oriented block where no other point was."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,6 +6,7 @@ variance components of the rays -> absolute orientation -> robust bundle block a
 
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
@@ -24,6 +25,7 @@ from uavkit.process.approximations import GrowingBlock, orient_approximately, ra
 from uavkit.process.calibration import calibrated
 from uavkit.process.candidates import Candidates, empty, from_measurements, join
 from uavkit.process.features import feature_tasks, match_features, pairs_to_compare
+from uavkit.process.filling import RichPlaces, fill, rich_places
 from uavkit.process.measurement import measure_rays
 from uavkit.process.network import (
     AdjustedNetwork,
@@ -41,8 +43,11 @@ from uavkit.process.pictures import PictureStore, PyramidStore
 from uavkit.process.ray_sigma import SigmaCalibration
 from uavkit.process.summary import Findings, peak_memory_mb, summarise
 from uavkit.process.thinning import points_apart
-from uavkit.process.tie_points import TiePointMatching
+from uavkit.process.tie_points import ObjectGeometry, TiePointMatching, object_geometry, surface_normals
 from uavkit.process.video_points import VideoInput, candidates_through_video
+
+FILLING_ROUNDS = (1, 2, 3, 3)
+"""Points that are tried in each empty cell, in one round after the other."""
 
 
 @dataclass(kw_only=True)
@@ -104,9 +109,9 @@ def orient_block(
     )
     candidates, growing = _approximate_block(place)
     marked = marked_points(block)
-    tied, network, reasons = _tie(place, candidates, growing, marked)
+    tied = _tie(place, candidates, growing, marked)
     with place.step("absolute orientation"):
-        network, oriented_absolutely = _to_object_space(place, network, marked)
+        network, oriented_absolutely = _to_object_space(place, tied.network, marked)
     with place.step("adjustment"):
         place.progress("adjustment", 0, 1)
         adjusted = adjust_network(
@@ -116,9 +121,9 @@ def orient_block(
     with place.step("summary"):
         found = Findings(
             block=block,
-            reasons=reasons,
-            candidates=candidates,
-            tied=tied,
+            reasons=tied.reasons,
+            candidates=tied.found,
+            tied=tied.tied,
             network=network,
             marked=marked,
             adjusted=adjusted,
@@ -251,39 +256,76 @@ def _approximately(place: Workplace, candidates: Candidates, *, last: bool) -> G
         return None
 
 
-def _tie(
-    place: Workplace, candidates: Candidates, growing: GrowingBlock, marked: MarkedPoints
-) -> tuple[Candidates, Network, dict[int, str]]:
-    """Find every point in every still that should see it, twice: the second time with the better orientation.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Tied:
+    """A free network whose points were looked for in all stills."""
 
-    Also returns why stills are not oriented.
-    """
+    found: Candidates
+    """Before tie point matching."""
+    tied: Candidates
+    network: Network
+    reasons: dict[int, str]
+    """Why stills are not oriented."""
+
+
+def _tie(place: Workplace, candidates: Candidates, growing: GrowingBlock, marked: MarkedPoints) -> _Tied:
+    """Find every point in every still that should see it, twice: in between, points are added where there are none."""
     matching = TiePointMatching(
         pyramids=place.pyramids,
         options=place.options.measurement,
         workers=place.workers,
         progress=place.progress,
     )
-    tied, found = candidates, len(candidates)
+    found, tied, known, dropped = candidates, candidates, None, 0
     for turn in (1, 2):
         with place.step("free network"):
             growing = without_weak_stills(growing, tied, marked)
             network = network_of(growing, tied, marked)
             adjusted = _free_network(place, network, marked)
             growing = _regrown(growing, updated(network, adjusted))
+        geometry = object_geometry(growing, adjusted, len(candidates), candidates.reference_image)
         with place.step("tie points"):
-            tied = matching.match(candidates, growing, adjusted, known=None if turn == 1 else tied)
+            tied = matching.match(candidates, geometry, known)
             apart = points_apart(tied, 0.5 * place.options.measurement.window_px)
             candidates, tied = candidates.only_points(apart), tied.only_points(apart)
+            dropped += int(np.sum(~apart))
+        if turn == 1:
+            with place.step("filling"):
+                fresh = _filling(place, matching, growing, tied, geometry.only_points(apart))
+            found, candidates, known = join([found, fresh]), join([candidates, fresh]), join([tied, fresh])
+            tied = known
     with place.step("free network"):
         growing = without_weak_stills(growing, tied, marked)
         network = network_of(growing, tied, marked)
         adjusted = _free_network(place, network, marked)
         network, calibration = calibrated(updated(network, adjusted), adjusted)
         _note_calibration(place, calibration)
-    if found > len(tied):
-        place.notes.append(f"points left out because their matching windows overlap others': {found - len(tied)}")
-    return tied, network, growing.reasons
+    if dropped:
+        place.notes.append(f"points left out because their matching windows overlap others': {dropped}")
+    return _Tied(found=found, tied=tied, network=network, reasons=growing.reasons)
+
+
+def _filling(
+    place: Workplace, matching: TiePointMatching, growing: GrowingBlock, tied: Candidates, geometry: ObjectGeometry
+) -> Candidates:
+    """Return new points with one measured ray each, where the block has none; found ones lead on to farther ones."""
+
+    def places_in(image: int) -> RichPlaces:
+        return rich_places(place.pyramids.get(image), place.options.candidates, matching.margin_px)
+
+    with ThreadPoolExecutor(max(1, place.workers)) as pool:
+        places = list(pool.map(places_in, range(len(place.store))))
+    fresh = empty()
+    for per_cell in FILLING_ROUNDS:
+        filled = fill(geometry, places, per_cell)
+        more = matching.match_in_one(filled.candidates, filled.geometry)
+        fresh = join([fresh, more.only_points(np.bincount(more.ray_point, minlength=len(more)) > 0)])
+        every = join([tied, fresh])
+        points = network_of(growing, every, marked_points(place.block)).points[: len(every)]
+        view = growing.centres[every.reference_image] - points
+        normals = surface_normals(points, np.where(np.isfinite(view), view, 1.0))
+        geometry = replace(geometry, points=points, normals=normals)
+    return fresh
 
 
 def _free_network(place: Workplace, network: Network, marked: MarkedPoints) -> AdjustedNetwork:

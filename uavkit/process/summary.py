@@ -20,6 +20,7 @@ from uavkit.process.orientation_code import orientation_codes, richness
 from uavkit.process.pictures import PyramidStore
 from uavkit.process.pyramid import level_from_full
 
+_ORIGINS = (("video", PointOrigin.VIDEO), ("features", PointOrigin.FEATURES), ("filling", PointOrigin.FILLING))
 _TURN_COSINE = np.cos(np.radians(50.0))
 _PICTURE_LEVEL = 2
 
@@ -178,7 +179,7 @@ def _candidate_counts(found: Findings, used: NDArray[np.bool_]) -> dict[str, Can
     survived[rows[rows < found.network.marks_from]] = True
     seen = np.bincount(found.candidates.ray_point, minlength=len(found.candidates)) > 0
     counts = {}
-    for name, origin in (("video", PointOrigin.VIDEO), ("features", PointOrigin.FEATURES)):
+    for name, origin in _ORIGINS:
         of_origin = found.candidates.origin == origin
         counts[name] = CandidateCount(
             found=int((of_origin & seen).sum()), survived=int((survived & (found.tied.origin == origin)).sum())

@@ -28,6 +28,8 @@ from uavkit.process.pyramid import PyramidOptions, refine_through_pyramid
 _PROBE_PX = 8.0
 _MOST_OBLIQUE = np.cos(np.radians(72.0))
 _MOST_TURN = np.cos(np.radians(60.0))
+_DEPTH_ANGLE = np.cos(np.radians(8.0))
+"""Cosine of the angle between two rays from which on they fix a point's depth."""
 _DIRECT_RADIUS_PX = 2.0
 """Least squares matching pulls in from here without help."""
 _RADII_PX = (8.0, 16.0, 32.0, 64.0, 128.0)
@@ -52,6 +54,15 @@ class ObjectGeometry:
     def exterior(self, image: int) -> ExteriorOrientation:
         """Return the orientation of a still."""
         return ExteriorOrientation(projection_centre_m=self.centres[image], R_object_from_image=self.rotations[image])
+
+    def only_points(self, keep: Flags) -> "ObjectGeometry":
+        """Return the geometry of the points that a mask (m,) chooses."""
+        return replace(
+            self,
+            points=self.points[keep],
+            point_covariances=self.point_covariances[keep],
+            normals=self.normals[keep],
+        )
 
 
 def surface_normals(points: Array, view: Array, neighbours: int = 12) -> Array:
@@ -183,19 +194,34 @@ class TiePointMatching:
     workers: int
     progress: Progress
 
-    def match(
-        self, candidates: Candidates, growing: GrowingBlock, adjusted: AdjustedNetwork, known: Candidates | None
-    ) -> Candidates:
+    @property
+    def margin_px(self) -> float:
+        """Return how far from the border of a still points can be measured."""
+        return self.options.window_px / 2 + 3
+
+    def match(self, candidates: Candidates, geometry: ObjectGeometry, known: Candidates | None) -> Candidates:
         """Return the candidates with all rays that could be measured; rays of ``known`` are kept as they are."""
-        geometry = object_geometry(growing, adjusted, len(candidates), candidates.reference_image)
-        tasks, radii = visible_tasks(
-            geometry, candidates.reference_image, candidates.reference_px, self.options.window_px / 2 + 3
-        )
+        tasks, radii = self._tasks(candidates, geometry)
         if known is not None:
             todo = ~np.isin(_ray_keys(tasks.point, tasks.target_image), _ray_keys(known.ray_point, known.ray_image))
             tasks, radii = tasks.where(todo), radii[todo]
-        tasks, found = self._search(tasks, radii)
-        tasks, radii = tasks.where(found), radii[found]
+        return self._measured(candidates, tasks, radii, known)
+
+    def match_in_one(self, candidates: Candidates, geometry: ObjectGeometry) -> Candidates:
+        """Return the candidates with a ray, where it could be measured, in the one other still that suits each best."""
+        tasks, radii = self._tasks(candidates, geometry)
+        best = _best_view(geometry, tasks)
+        return self._measured(candidates, tasks.where(best), radii[best], None)
+
+    def _tasks(self, candidates: Candidates, geometry: ObjectGeometry) -> tuple[RayTasks, Array]:
+        return visible_tasks(geometry, candidates.reference_image, candidates.reference_px, self.margin_px)
+
+    def _measured(
+        self, candidates: Candidates, tasks: RayTasks, radii_px: Array, known: Candidates | None
+    ) -> Candidates:
+        """Return the candidates with the rays that searching and measuring gives, besides those of ``known``."""
+        tasks, found = self._search(tasks, radii_px)
+        tasks = tasks.where(found)
         rays = measure_rays(
             self.pyramids, tasks, self.options, workers=self.workers, progress=self.progress, stage="tie points"
         )
@@ -245,6 +271,16 @@ class TiePointMatching:
             for done, _ in enumerate(pool.map(search, jobs), start=1):
                 self.progress("tie point search", done, len(jobs))
         return replace(tasks, start_px=starts), np.asarray(found)
+
+
+def _best_view(geometry: ObjectGeometry, tasks: RayTasks) -> Indices:
+    """Return the row of one task of each point: the least angle between its rays that still fixes its depth."""
+    to_image = _unit(geometry.centres[tasks.target_image] - geometry.points[tasks.point])
+    to_reference = _unit(geometry.centres[tasks.reference_image] - geometry.points[tasks.point])
+    cosine = np.sum(to_image * to_reference, axis=1)
+    order = np.lexsort((np.where(cosine < _DEPTH_ANGLE, -cosine, 2.0 + cosine), tasks.point))
+    _, first = np.unique(tasks.point[order], return_index=True)
+    return np.asarray(order[first])
 
 
 def _ray_keys(point: Indices, image: Indices) -> Indices:

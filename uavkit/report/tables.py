@@ -414,13 +414,13 @@ def points_table(result: OrientedBlock) -> Table:
         mean = float(np.mean(rays[mine])) if np.any(mine) else float("nan")
         origins = [int(np.sum(mine & (result.point_origins == origin))) for origin in PointOrigin]
         rows.append((label, str(int(mine.sum())), *(str(count) for count in origins), number(mean, 1)))
-    header = ("Kind", "Points", "Marked by hand", "From the video", "From features", "Mean rays")
+    header = ("Kind", "Points", "Marked by hand", "From the video", "From features", "Filled in", "Mean rays")
     return Table(title="Object points", header=header, rows=tuple(rows))
 
 
 def candidates_table(result: OrientedBlock) -> Table:
     """Return how many candidates each way of finding points gave and how many are left."""
-    labels = {"video": "Followed through the video", "features": "Feature matching"}
+    labels = {"video": "Followed through the video", "features": "Feature matching", "filling": "Filled in"}
     rows = []
     for name, count in result.candidates.items():
         if not count.found:
