@@ -10,7 +10,7 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -144,6 +144,29 @@ def _places(model: pycolmap.Reconstruction, flight: Path) -> MarkedPlaces:
         control_surveyed_m=control_m,
         control_true_m=np.array([true[name] for name in used]),
     )
+
+
+def shape_errors(model: pycolmap.Reconstruction, truth: Mapping[str, Any]) -> dict[str, float]:
+    """Return what is wrong with the shape of a model, in mm: places of all signals, intersected from their exact marks.
+
+    A similarity transformation to the truth takes out the datum; neither survey nor marks have noise here, so that what
+    remains is the error of the orientations alone.
+    """
+    images = {image.name: image for image in model.images.values() if image.has_pose}
+    found, true = [], []
+    for point in (*truth["control_points"], *truth["check_points"]):
+        marks = [(images[name], np.array(pixel)) for name, pixel in point["marks"].items() if name in images]
+        if len(marks) >= 2:
+            found.append(_intersected(model, marks))
+            true.append(point["position_m"])
+    places, wanted = np.array(found), np.array(true)
+    return root_mean_squares("shape", (fit_similarity(places, wanted).apply(places) - wanted) ** 2)
+
+
+def largest_model(folder: Path) -> pycolmap.Reconstruction:
+    """Return the largest of the models that COLMAP wrote into a folder."""
+    models = [pycolmap.Reconstruction(path) for path in sorted(folder.iterdir()) if path.is_dir()]
+    return max(models, key=lambda model: model.num_reg_images())
 
 
 def main(flight: Path, work: Path, result: Path) -> None:
