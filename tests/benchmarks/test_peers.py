@@ -11,9 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.process.test_least_squares_matching import make_pair, turned
 from tests.process.textures import picture, wave_texture
-from uavkit.process.least_squares_matching import match_least_squares
 from uavkit.process.orientation_code import orientation_codes
 from uavkit.process.tracking import TimedPicture, advance, start
 
@@ -55,41 +53,3 @@ def test_tracking_step_against_lucas_kanade() -> None:
     peer_s = best_s(lambda: cv2.calcOpticalFlowPyrLK(before, after, given, None, winSize=(21, 21), maxLevel=3))
     tell("tracking step, 1000 points", ours_s, peer_s, 1e-3, "ms")
     print(f"  of which the orientation code image: {best_s(lambda: orientation_codes(before)) * 1e3:.2f} ms")
-
-
-def test_least_squares_matching_against_ecc() -> None:
-    """31 x 31 px, affine, turned by 5 degrees; OpenCV's findTransformECC patch by patch, its own gain and offset."""
-    pair = make_pair(matrix=turned(5.0), gain=1.1)
-    n = len(pair.reference_px)
-    warps = np.tile(np.eye(2), (n, 1, 1))
-    began = pair.truth_px + 0.5
-    ours = match_least_squares(pair.reference, pair.target, pair.reference_px, began, warps)
-    error = np.linalg.norm(ours.target_px - pair.truth_px, axis=1)[ours.ok]
-    peer = ecc(pair, began)
-    peer_error = np.linalg.norm(peer - pair.truth_px, axis=1)
-    good = peer_error < 1.0
-    assert ours.ok.mean() > 0.95
-    ours_s = best_s(lambda: match_least_squares(pair.reference, pair.target, pair.reference_px, began, warps)) / n
-    peer_s = best_s(lambda: ecc(pair, began)) / n
-    tell("least squares matching, a point", ours_s, peer_s, 1e-6, "us")
-    print(
-        f"  error rms {np.sqrt(np.mean(error**2)):.3f} px, OpenCV {np.sqrt(np.mean(peer_error[good] ** 2)):.3f} px; "
-        f"failures {int((~ours.ok).sum())} and {int((~good).sum())} of {n}"
-    )
-
-
-def ecc(pair, began):  # type: ignore[no-untyped-def]
-    """Return where findTransformECC puts each point."""
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 1e-3)
-    result = np.full(pair.truth_px.shape, np.nan)
-    for row, (at, guess) in enumerate(zip(pair.reference_px, began, strict=True)):
-        template = cv2.getRectSubPix(pair.reference, (31, 31), (float(at[0]), float(at[1])))
-        corner = np.round(guess).astype(int) - 23
-        search = pair.target[corner[1] : corner[1] + 47, corner[0] : corner[0] + 47]
-        warp = np.column_stack([np.eye(2), guess - corner - 15.0]).astype(np.float32)
-        try:
-            _, warp = cv2.findTransformECC(template, search, warp, cv2.MOTION_AFFINE, criteria, None, 1)
-        except cv2.error:
-            continue
-        result[row] = warp[:, :2] @ [15.0, 15.0] + warp[:, 2] + corner
-    return np.nan_to_num(result, nan=1e9)
