@@ -168,26 +168,41 @@ def test_flat_matches_flat_only_in_the_variant() -> None:
 
 
 @pytest.mark.parametrize("variant", list(Dissimilarity))
-def test_fast_matching_equals_the_reference(variant: Dissimilarity) -> None:
+@pytest.mark.parametrize(("window", "radius"), [(9, 8), (15, 5), (21, 3), (25, 7), (31, 4)])
+def test_fast_matching_equals_the_reference(variant: Dissimilarity, window: int, radius: int) -> None:
     reference, search = textured(7, noise=6.0), textured(8, noise=6.0)  # different textures: any placement may win
     rng = np.random.default_rng(0)
     points = rng.integers(40, (160, 120), (40, 2)).astype(float)
+    half = window // 2
+    points[:5, 0] = 199 - half - radius - 3  # the search ends with the picture
     plan = MatchPlan(
         reference_px=points,
         predicted_px=points + [3.0, -2.0],
         reference_from_target=np.tile(np.eye(2), (40, 1, 1)),
-        radii_px=np.full(40, 5),
+        radii_px=np.full(40, radius),
     )
-    many = match_codes_at(reference, packed_codes(search, 60), plan, threshold=60, window_px=15, variant=variant)
+    many = match_codes_at(reference, packed_codes(search, 60), plan, threshold=60, window_px=window, variant=variant)
     a, b = orientation_codes(reference, threshold=60), orientation_codes(search, threshold=60)
     for i, (column, row) in enumerate(points.astype(int)):
-        template = a[row - 7 : row + 8, column - 7 : column + 8]
-        left, top = column + 3 - 5 - 7, row - 2 - 5 - 7
-        one = match_codes(template, b[top : top + 25, left : left + 25], variant)
+        template = a[row - half : row + half + 1, column - half : column + half + 1]
+        left, top, side = column + 3 - radius - half, row - 2 - radius - half, window + 2 * radius
+        one = match_codes(template, b[top : top + side, left : left + side], variant)
         assert many.dissimilarity[i] == pytest.approx(one.dissimilarity, abs=1e-9)
-        assert many.points_px[i] - [left + 7, top + 7] == pytest.approx(one.column_row_px, abs=1e-9)
+        assert many.points_px[i] - [left + half, top + half] == pytest.approx(one.column_row_px, abs=1e-9)
         assert many.ambiguity[i] == pytest.approx(one.dissimilarity / one.second_best, abs=1e-6)
         assert many.on_rim[i] == one.on_rim
+
+
+@pytest.mark.parametrize("window", [20, 33])
+def test_windows_that_the_kernel_cannot_hold_are_refused(window: int) -> None:
+    plan = MatchPlan(
+        reference_px=np.array([[80.0, 80.0]]),
+        predicted_px=np.array([[80.0, 80.0]]),
+        reference_from_target=np.eye(2)[None],
+        radii_px=np.array([3]),
+    )
+    with pytest.raises(InputError, match="window_px must be odd and at most 31"):
+        match_codes_at(textured(), packed_codes(textured()), plan, threshold=30, window_px=window)
 
 
 def test_equal_slopes_find_the_point_of_a_v() -> None:

@@ -1,12 +1,15 @@
 """Tracking through simulated interlaced video: plane ground, relief, turns, brightness, blind pictures."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import pytest
 
-from tests.process.video_of_truth import FIELD_S, Pose, Scene, fields, make_scene, positions, straight
+from tests.process import textures
+from tests.process.video_of_truth import FIELD_S, OVER, Pose, Scene, fields, make_scene, positions, straight
 from uavkit.core.errors import AdjustmentError, InputError
 from uavkit.process.affine_motion import (
     apply_affine,
@@ -112,6 +115,74 @@ def test_climbing_and_turning(plane: Scene) -> None:
 def test_brightness_jumps(plane: Scene) -> None:
     pose = straight((20, 100), SECONDS)
     demand(follow(plane, pose, film(plane, pose, gain=lambda i: 1.4 if (i // 21) % 2 else 1.0)), 0.95)
+
+
+def crop(scene: Scene, period_px: float, noise: float) -> Scene:
+    """The scene under a crop: rows with plants along them, the same everywhere, and a little of the scene's texture."""
+    y, x = np.indices(scene.grey.shape, dtype=np.float32) / OVER
+    c, s = np.cos(0.3), np.sin(0.3)
+    rows = np.cos(2 * np.pi * (c * x + s * y) / period_px)
+    plants = np.cos(2 * np.pi * (c * y - s * x) / (0.6 * period_px))
+    return replace(scene, grey=(120 + 25 * rows * (0.6 + 0.4 * plants) + noise * (scene.grey - 120)).astype(np.float32))
+
+
+@pytest.mark.parametrize("period_px", [10.0, 15.0])
+def test_rows_of_crop_do_not_make_points_jump_a_period(plane: Scene, period_px: float) -> None:
+    scene, pose = crop(plane, period_px, 0.3), straight((20, 100), SECONDS)
+    outcome = follow(scene, pose, film(scene, pose))
+    assert outcome.alive.mean() > 0.8
+    error = outcome.error_px[outcome.alive]
+    assert np.median(error) < 0.5
+    assert (error > 2).mean() < 0.01  # a plant is 6 px long, a row 10 px wide: a jump would show
+
+
+def test_low_contrast_is_followed(plane: Scene) -> None:
+    """Texture of 6 grey values (standard deviation) under noise of 2.5."""
+    scene, pose = replace(plane, grey=120 + (plane.grey - 120) * np.float32(6 / 38)), straight((20, 100), SECONDS)
+    outcome = follow(scene, pose, film(scene, pose))
+    assert outcome.alive.mean() > 0.8
+    error = outcome.error_px[outcome.alive]
+    assert np.median(error) < 0.5
+    assert np.quantile(error, 0.95) < 2.0
+
+
+@pytest.mark.parametrize("gain", [0.6, 1.4])
+def test_a_change_of_gain_costs_no_points(gain: float) -> None:
+    """As many are right as Lucas-Kanade has where nothing changes; with the change it loses many."""
+    texture, move = textures.wave_texture(np.random.default_rng(3)), np.array([2.4, -1.8])
+    moved = np.column_stack([np.eye(2), move])
+
+    def seen(brighter: float, shift: np.ndarray, seed: int) -> np.ndarray:
+        rng = np.random.default_rng(seed)
+        return textures.picture(
+            texture, (240, 320), shift, gain=40 * brighter, offset=125 * brighter, noise=2.0, rng=rng
+        )
+
+    before, same, changed = seen(1.0, np.eye(2, 3), 1), seen(1.0, moved, 2), seen(gain, moved, 2)
+    points = np.random.default_rng(4).uniform(40, [280, 200], (250, 2))
+    truth = points - move
+    state = start(TimedPicture(image=before, time_s=0.0), points)
+    ours = advance(state, TimedPicture(image=changed, time_s=0.04), np.random.default_rng(0))
+    given = points.astype(np.float32)
+    right = ((ours.misses == 0) & (np.linalg.norm(ours.points_px - truth, axis=1) < 1.0)).sum()
+    peer = [
+        cv2.calcOpticalFlowPyrLK(before, after, given, None, winSize=(21, 21), maxLevel=3)[0]
+        for after in (same, changed)
+    ]
+    peer_right = [(np.linalg.norm(found - truth, axis=1) < 1.0).sum() for found in peer]
+    assert right >= peer_right[0]
+    assert peer_right[1] < 0.8 * peer_right[0]  # so the change is one
+
+
+def test_threads_change_no_bit(plane: Scene) -> None:
+    pose = straight((20, 100), SECONDS)
+    pictures = film(plane, pose, count=40)
+    points = np.random.default_rng(0).uniform(30, [610, 450], (400, 2))
+    alone = track(pictures, points, rng=np.random.default_rng(0))
+    with ThreadPoolExecutor(3) as pool:
+        shared = track(pictures, points, rng=np.random.default_rng(0), pool=pool)
+    for name in ("points_px", "alive", "dissimilarity", "ambiguity", "affine", "warps"):
+        assert np.array_equal(getattr(alone, name), getattr(shared, name), equal_nan=True)
 
 
 def spoilt(pictures: list[TimedPicture], bad: Callable[[int], str]) -> list[TimedPicture]:

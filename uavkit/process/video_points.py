@@ -4,9 +4,12 @@ Anai et al. 2012, figure 7. Both stills take part as pictures of the sequence, r
 error of the transformation between still and video cancels.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass
-from itertools import pairwise
+from functools import lru_cache
+from itertools import islice, pairwise
 
 import cv2
 import numpy as np
@@ -78,7 +81,16 @@ class _Carried:
 def candidates_through_video(
     given: VideoInput, cache: StepCache, *, workers: int, progress: Progress
 ) -> VideoCandidates:
-    """Follow points through all gaps between stills that have a place in the video."""
+    """Follow points through all gaps between stills that have a place in the video.
+
+    Several workers match, and decode video and stills ahead, a bounded number of pictures; the result is the same to
+    the last bit with any number of them.
+    """
+    with ThreadPoolExecutor(workers) if workers > 1 else nullcontext() as pool:
+        return _through_all_gaps(given, cache, Helpers(given, pool, workers), progress)
+
+
+def _through_all_gaps(given: VideoInput, cache: StepCache, helpers: "Helpers", progress: Progress) -> VideoCandidates:
     places = given.sync.places
     row_of = {name: row for row, name in enumerate(given.store.names)}
     parts: list[tuple[Indices, Indices, Array, Array]] = []
@@ -89,7 +101,7 @@ def candidates_through_video(
     for number, (here, there) in enumerate(pairwise(places)):
         progress("tracking through the video", number, len(places) - 1)
         image, target = row_of[here.still], row_of[there.still]
-        fresh = _new_points(given, image, carried.here_px)
+        fresh = _new_points(given, helpers.chosen(image), image, carried.here_px)
         references.append((np.full(len(fresh), image), fresh))
         points = _with_new(carried, fresh, image, total)
         total += len(fresh)
@@ -97,7 +109,7 @@ def candidates_through_video(
             "video",
             _gap_key(given, image, target, (here, there), points),
             lambda here=here, there=there, target=target, points=points: _follow_gap(  # type: ignore[misc]
-                given, (here, there), target, points, workers
+                given, (here, there), target, points, helpers
             ),
         )
         ok = step["ok"]
@@ -122,17 +134,74 @@ def _nothing_carried() -> _Carried:
     )
 
 
-def _new_points(given: VideoInput, image: int, present_px: Array) -> Array:
-    """Choose points of highest orientation code richness, evenly spread, where no carried point is near; (n, 2)."""
+class Helpers:
+    """Threads that share the work, and what tracking needs of each still, made once: of the next one ahead of time."""
+
+    def __init__(self, given: VideoInput, pool: Executor | None = None, workers: int = 1) -> None:
+        self.pool, self.workers = pool, workers
+        self._given = given
+        self._coming: tuple[int, Future[object]] | None = None
+        self._as_video = lru_cache(maxsize=3)(self._reduce)
+        self._chosen = lru_cache(maxsize=3)(lambda image: _choose_points(given, image))
+
+    def _reduce(self, image: int) -> Image:
+        info = self._given.video.info()
+        shape = info.height_px, info.width_px
+        return still_as_video(self._given.store.grey(image), self._given.sync.still_from_video, shape)
+
+    def expect(self, image: int) -> None:
+        """Begin to make what will be asked about a still, where there is a thread to do it."""
+        if self.pool is not None:
+            self._coming = image, self.pool.submit(lambda: (self._as_video(image), self._chosen(image)))
+
+    def _wait_for(self, image: int) -> None:
+        if self._coming is not None and self._coming[0] == image:
+            self._coming[1].result()
+            self._coming = None
+
+    def as_video(self, image: int) -> Image:
+        """Return a still as the video would show it."""
+        self._wait_for(image)
+        return self._as_video(image)
+
+    def chosen(self, image: int) -> Array:
+        """Return the points (n, 2) of a still that are worth following."""
+        self._wait_for(image)
+        return self._chosen(image)
+
+
+def read_ahead(pictures: Iterable[TimedPicture], pool: Executor | None, at_once: int = 8) -> Iterator[TimedPicture]:
+    """Yield pictures while a thread already reads the next few."""
+    if pool is None:
+        yield from pictures
+        return
+    source = iter(pictures)
+    coming = pool.submit(lambda: list(islice(source, at_once)))
+    while batch := coming.result():
+        coming = pool.submit(lambda: list(islice(source, at_once)))
+        yield from batch
+
+
+def _cell_px(given: VideoInput, image: int) -> tuple[int, int]:
+    """Return the level of the pyramid on which points are chosen, and the side of its cells."""
     pyramid = given.pyramids.get(image)
     level = min(_DETECTION_LEVEL, len(pyramid.grey) - 1)
-    small = pyramid.grey[level]
-    cell_px = max(8, max(small.shape) // given.candidates.cells)
-    field = richness(orientation_codes(small))
-    chosen = full_from_level(select_points(field, cell_px, given.candidates.per_cell, 16), level)
+    return level, max(8, max(pyramid.grey[level].shape) // given.candidates.cells)
+
+
+def _choose_points(given: VideoInput, image: int) -> Array:
+    """Choose points of highest orientation code richness, evenly spread, (n, 2)."""
+    level, cell_px = _cell_px(given, image)
+    field = richness(orientation_codes(given.pyramids.get(image).grey[level]))
+    return full_from_level(select_points(field, cell_px, given.candidates.per_cell, 16), level)
+
+
+def _new_points(given: VideoInput, chosen: Array, image: int, present_px: Array) -> Array:
+    """Of the points chosen in a still (n, 2) those that have no carried point near."""
     if len(present_px) == 0 or len(chosen) == 0:
         return chosen
-    nearest = np.min(np.linalg.norm(chosen[:, None] - present_px[None], axis=2), axis=1)
+    level, cell_px = _cell_px(given, image)
+    nearest, _ = cKDTree(present_px).query(chosen)
     return np.asarray(chosen[nearest > 0.35 * cell_px * 2.0**level])
 
 
@@ -166,7 +235,7 @@ def _gap_key(
     sync = given.sync
     return content_hash(
         [
-            "video 2",
+            "video 3",
             given.video.fingerprint(),
             given.store.fingerprint(image),
             given.store.fingerprint(target),
@@ -183,26 +252,36 @@ def _gap_key(
 
 
 def _follow_gap(
-    given: VideoInput, places: tuple[StillInVideo, StillInVideo], target: int, points: _Carried, workers: int
+    given: VideoInput, places: tuple[StillInVideo, StillInVideo], target: int, points: _Carried, helpers: Helpers
 ) -> Arrays:
     """Track points of one still to the next, descend to its pixels, and measure them against their references."""
-    tracked_px, tracked, there_from_here = track_between_stills(given, places, points.here_px)
+    helpers.expect(target)
+    tracked_px, tracked, there_from_here = track_between_stills(given, places, points.here_px, helpers)
+    helpers.as_video(target)  # waits until the pictures of the target are there: they need not be made twice
     xy, extended, there_from_here = extend_motion(points.here_px, tracked_px, tracked, there_from_here)
     warps = there_from_here @ points.here_from_reference
     found = np.zeros(len(xy), dtype=bool)
-    for group, radius in ((tracked, _VIDEO_RADIUS), (extended, _EXTENDED_RADIUS)):
-        for reference in np.unique(points.reference_image[group]).tolist():
-            rows = np.flatnonzero(group & (points.reference_image == reference))
-            refined = refine_through_pyramid(
-                given.pyramids.get(reference),
-                given.pyramids.get(target),
-                points.reference_px[rows],
-                xy[rows],
-                warps[rows],
-                PyramidOptions(start_radius_px=radius * _still_px_per_video_px(given.sync)),
-            )
-            xy[rows[refined.ok]], found[rows] = refined.target_px[refined.ok], refined.ok
-    return _measured(given, target, points, xy, warps, found, workers)
+    jobs = [
+        (radius, reference, np.flatnonzero(group & (points.reference_image == reference)))
+        for group, radius in ((tracked, _VIDEO_RADIUS), (extended, _EXTENDED_RADIUS))
+        for reference in np.unique(points.reference_image[group]).tolist()
+    ]
+
+    def descend(job: tuple[float, int, Indices]) -> None:
+        radius, reference, rows = job
+        refined = refine_through_pyramid(
+            given.pyramids.get(reference),
+            given.pyramids.get(target),
+            points.reference_px[rows],
+            xy[rows],
+            warps[rows],
+            PyramidOptions(start_radius_px=radius * _still_px_per_video_px(given.sync)),
+        )
+        xy[rows[refined.ok]], found[rows] = refined.target_px[refined.ok], refined.ok
+
+    for _ in map(descend, jobs) if helpers.pool is None else helpers.pool.map(descend, jobs):
+        pass
+    return _measured(given, target, points, xy, warps, found, helpers.workers)
 
 
 def _still_px_per_video_px(sync: VideoSync) -> float:
@@ -257,12 +336,16 @@ def _measured(
 
 
 def track_between_stills(
-    given: VideoInput, places: tuple[StillInVideo, StillInVideo], here_px: Array
+    given: VideoInput,
+    places: tuple[StillInVideo, StillInVideo],
+    here_px: Array,
+    helpers: Helpers | None = None,
 ) -> tuple[Array, Flags, Array]:
     """Follow points (n, 2) of one still through the video to the next one.
 
     Returns where they are there (n, 2) in still pixels, which were found, and there_from_here (n, 2, 2) about each.
     """
+    helpers = helpers or Helpers(given)
     nothing = here_px.copy(), np.zeros(len(here_px), dtype=bool), np.tile(np.eye(2), (len(here_px), 1, 1))
     video_from_still = given.sync.still_from_video.inverse()
     info = given.video.info()
@@ -270,9 +353,9 @@ def track_between_stills(
     inside = np.all((start > 12) & (start < np.array([info.width_px - 13, info.height_px - 13])), axis=1)
     if int(inside.sum()) < 6:
         return nothing
-    pictures = _pictures_between(given, places, (info.height_px, info.width_px))
+    pictures = pictures_between(given, places, helpers)
     try:
-        result = track(pictures, start[inside], rng=np.random.default_rng(places[0].last_frame))
+        result = track(pictures, start[inside], rng=np.random.default_rng(places[0].last_frame), pool=helpers.pool)
     except InputError:
         return nothing
     end_s = places[1].exposure_time_ns * 1e-9
@@ -284,24 +367,25 @@ def track_between_stills(
     return xy, alive, warps
 
 
-def _pictures_between(
-    given: VideoInput, places: tuple[StillInVideo, StillInVideo], shape: tuple[int, int]
+def pictures_between(
+    given: VideoInput, places: tuple[StillInVideo, StillInVideo], helpers: Helpers
 ) -> Iterator[TimedPicture]:
     """Yield the first still, all fields between the two shutters, and the second still, all in video geometry."""
     here, there = places
     names = given.store.names
-    yield TimedPicture(
-        image=still_as_video(given.store.grey(names.index(here.still)), given.sync.still_from_video, shape),
-        time_s=here.exposure_time_ns * 1e-9,
-    )
-    for frame in given.video.frames(here.first_frame, there.last_frame):
+    image = helpers.as_video(names.index(here.still))
+    yield TimedPicture(image=image, time_s=here.exposure_time_ns * 1e-9)
+    yield from read_ahead(_fields_between(given, places), helpers.pool)
+    image = helpers.as_video(names.index(there.still))
+    yield TimedPicture(image=image, time_s=there.exposure_time_ns * 1e-9)
+
+
+def _fields_between(given: VideoInput, places: tuple[StillInVideo, StillInVideo]) -> Iterator[TimedPicture]:
+    """Yield all fields between two shutters with square pixels."""
+    for frame in given.video.frames(places[0].first_frame, places[1].last_frame):
         for field in fields_of_frame(frame, given.sync.field_order, given.sync.frame_interval_ns):
             image = field.lines if field.row_step == 1 else square_field(field.lines, field.first_row)
             yield TimedPicture(image=image, time_s=field.time_ns * 1e-9, usable=not frame.damaged)
-    yield TimedPicture(
-        image=still_as_video(given.store.grey(names.index(there.still)), given.sync.still_from_video, shape),
-        time_s=there.exposure_time_ns * 1e-9,
-    )
 
 
 def still_as_video(grey: Image, still_from_video: AffineTransformation, shape: tuple[int, int]) -> Image:

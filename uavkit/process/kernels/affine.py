@@ -262,3 +262,15 @@ def local_warps(
             warps[row, j, 0] += min(max(u, -limits[1]), limits[1])
             warps[row, j, 1] += min(max(v, -limits[1]), limits[1])
             expected[row, j] = (cx if j == 0 else cy) + warps[row, j, 0] * x + warps[row, j, 1] * y
+
+
+@kernel
+def over_inverse(left: NDArray[np.float64], right: NDArray[np.float64], result: NDArray[np.float64]) -> None:
+    """left right^-1 for each of many (2, 2) matrices."""
+    for row in range(left.shape[0]):
+        a, b, c, d = right[row, 0, 0], right[row, 0, 1], right[row, 1, 0], right[row, 1, 1]
+        determinant = a * d - b * c
+        for i in range(2):
+            p, q = left[row, i, 0], left[row, i, 1]
+            result[row, i, 0] = (p * d - q * c) / determinant
+            result[row, i, 1] = (q * a - p * b) / determinant
