@@ -47,6 +47,7 @@ def nadir_block(rng: np.random.Generator, strips: int, images: int, points: int)
         gnss=GnssObservations(
             image_index=np.arange(n), position_m=centres + rng.normal(0, GNSS_SIGMA_M, (n, 3)),
             sigma_m=np.full((n, 3), GNSS_SIGMA_M), flight=np.zeros(n, dtype=np.int64),
+            shift_sigma_m=(0.02, 0.02, 0.03),
         ),
     )  # fmt: skip
 

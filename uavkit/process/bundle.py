@@ -30,6 +30,7 @@ from uavkit.process.bundle_system import (
     BundleSystem,
     Precision,
     State,
+    Step,
     Weights,
     build_system,
     gauss_newton_step,
@@ -42,6 +43,10 @@ from uavkit.process.robust import cut_variance
 
 Values = TypeVar("Values", Array, Flags)
 UNDETERMINED_SHARE = 0.9
+GOOD_GAIN = 0.25
+"""Of a step that was about right: the next one may be damped less."""
+POOR_GAIN = 0.1
+"""Steps of a gain below this were much too long: damping grows although they lessened the sum of squares."""
 
 
 def adjust_block(
@@ -123,10 +128,22 @@ def solve(system: BundleSystem, state: State, weights: Weights, options: Adjustm
     damping = 0.0 if options.robust else 1e-4
     for number in range(1, options.most_iterations + 1):
         step = gauss_newton_step(system, state, weights, damping)
-        state, damping = step.state, step.damping
+        state = step.state
         if step.size < options.convergence:
             return state, number, True
+        damping = next_damping(step)
     return state, options.most_iterations, False
+
+
+def next_damping(step: Step) -> float:
+    """Return the damping of the step after this one: less where the last one did what it promised.
+
+    Levenberg-Marquardt's rule (Marquardt 1963) with the gain of the step as its measure (Nielsen 1999).
+    """
+    if step.damping == 0.0 or step.gain > GOOD_GAIN:
+        return step.damping
+    used = 10.0 * step.damping
+    return used if step.gain > POOR_GAIN else 10.0 * used
 
 
 class _Run:

@@ -430,6 +430,8 @@ class Step:
     """For the next step."""
     size: float
     """sqrt(step . right-hand side): no unknown changes by more than this many of its own sigmas."""
+    gain: float
+    """By how much the weighted sum of squares fell, over what it would fall by if all were linear."""
     determined: Flags
 
 
@@ -453,10 +455,16 @@ def gauss_newton_step(system: BundleSystem, state: State, weights: Weights, damp
         change = _solve(system, state, weights, damping, factor, reduced)
         for share in (1.0, 0.5, 0.25, 0.125):
             candidate = moved(system, state, change, share)
-            if cost(system, candidate, weights, determined) <= before * (1.0 + 1e-11) + 1e-9:
-                size = float(np.sqrt(max(change.product, 0.0)))
-                next_damping = damping / 10.0 if damping > 1e-9 else 0.0
-                return Step(state=candidate, damping=next_damping, size=size, determined=determined)
+            after = cost(system, candidate, weights, determined)
+            if after <= before * (1.0 + 1e-11) + 1e-9:
+                product = max(change.product, 1e-300)
+                return Step(
+                    state=candidate,
+                    damping=damping / 10.0 if damping > 1e-9 else 0.0,
+                    size=float(np.sqrt(product)),
+                    gain=(before - after) / product,
+                    determined=determined,
+                )
         damping = max(damping * 10.0, 1e-8)
     raise AdjustmentError("the adjustment does not converge: no step lessens the sum of squared residuals")
 

@@ -21,8 +21,8 @@ from uavkit.process.kernels.bundle_precision import Inverse
 
 LEAST_EIGENVALUE = 2e-14
 """Of the normal matrix scaled to unit diagonal before points are eliminated; rounding leaves about 1e-15."""
-SMALL = 500
-"""Matrices of up to so many rows are factored without LAPACK, whose threads would only wait for one another."""
+SMALL = 64
+"""Matrices of up to so many rows are factored without LAPACK."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -162,6 +162,7 @@ class DenseFactor:
         )
 
 
+@one_blas_thread()
 def factor_dense(reduced: Reduced, damping: float, datum: "InnerDatum | None") -> ReducedFactor:
     """Factor the whole matrix by Cholesky's method (LAPACK); a ``Factoriser``."""
     diagonal = check_observed(reduced)
