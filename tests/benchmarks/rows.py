@@ -16,9 +16,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-RESULTS = Path(__file__).parent / "results"
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "tests" / "benchmarks" / "results"
 ROWS = RESULTS / "rows.jsonl"
-WORK = Path(os.environ.get("UAVKIT_BENCH", Path(__file__).parents[2] / "bench"))
+WORK = Path(os.environ.get("UAVKIT_BENCH", ROOT / "bench"))
 """Where simulated surveys and other large files lie; not kept with the project."""
 
 Row = dict[str, Any]
@@ -63,17 +64,24 @@ def forget(benchmarks: Sequence[str], path: Path = ROWS) -> int:
 
 def _circumstances() -> Row:
     """Return commit, day and machine of a measurement, with what else the machine had to do."""
-    root = Path(__file__).parents[2]
-    described = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], cwd=root, capture_output=True, text=True, check=False
-    )
     return {
-        "commit": described.stdout.strip() or "unknown",
+        "commit": _commit(),
         "day": datetime.now(UTC).strftime("%Y-%m-%d"),
         "cores": os.cpu_count(),
         "load": round(os.getloadavg()[0], 1),
         "python": platform.python_version(),
     }
+
+
+def _commit() -> str:
+    """Return the commit of the checkout; "-dirty" where files other than the results differ from it."""
+    commit = _git("rev-parse", "--short", "HEAD") or "unknown"
+    changed = _git("status", "--porcelain", "--untracked-files=no", "--", ".", f":(exclude){RESULTS.relative_to(ROOT)}")
+    return f"{commit}-dirty" if changed else commit
+
+
+def _git(*arguments: str) -> str:
+    return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
 
 
 if __name__ == "__main__":
