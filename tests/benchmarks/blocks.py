@@ -21,6 +21,8 @@ from uavkit.simulate.truth import read_truth
 
 CASES = Path(__file__).with_name("cases.toml")
 RENDER_THREADS = "1"
+OPTIONAL = ("video", "control-points")
+"""Originals that not every flight has."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +115,7 @@ def ingest(case: Case) -> Finished:
         "check-points": "check_points.csv",
     }
     known = {role: flight / name for role, name in originals.items() if role not in case.without}
-    given = {role: path for role, path in known.items() if role != "video" or path.is_file()}
+    given = {role: path for role, path in known.items() if role not in OPTIONAL or path.is_file()}
     words = [word for role, path in given.items() for word in (f"--{role}", str(path))]
     return run_measured(["uavkit.cli", "ingest", str(survey), *words], _log(case, "ingest"))
 

@@ -134,6 +134,7 @@ def ratio_in_rows(name: str) -> Callable[[Rows], float]:
 FULL, PEER, SPEED = "accuracy full size", "COLMAP full size", "process speed"
 TEXTURES = "textures half scale"
 TIES = "fewest_ties_of_neighbouring_strips"
+CALIBRATED = "true_over_calibrated"
 SIX = {FULL: 6}
 BOTH = {FULL: 6, PEER: 6}
 EVERY = {name: len(cases(name)) for name in (FULL, "accuracy half scale", "terrains half scale", "accuracy RTK")}
@@ -169,6 +170,9 @@ BARS: tuple[Bar, ...] = (
         measure=largest_share("ours_peak_mb", "colmap_peak_mb"),
         most=1.0,
     ),
+    Bar(rows={"matching speed": 2}, what="times as fast as ECC, least", measure=smallest("ratio")),
+    Bar(rows={"rays": 4}, what="true over calibrated sigma, least", measure=smallest(CALIBRATED), least=0.75),
+    Bar(rows={"rays": 4}, what="true over calibrated sigma, largest", measure=largest(CALIBRATED), most=1.25),
     Bar(rows={"memory": 2}, what="largest peak memory, MB", measure=largest("peak_mb"), most=3072),
     Bar(rows={"memory": 2}, what="largest over smallest peak memory", measure=spread_of("peak_mb"), most=1.1),
     Bar(
