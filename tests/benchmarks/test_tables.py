@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.benchmarks import rows as kept
-from tests.benchmarks.blocks import cases
+from tests.benchmarks.blocks import cases, rendered
 from tests.benchmarks.evaluation import (
     MarkedPlaces,
     check_point_errors,
@@ -147,6 +147,21 @@ def test_exact_shape_on_noisy_control_shows_the_noise_of_control() -> None:
     assert told["rmse_true_xy_mm"] > 0.5
     assert told["rmse_of_exact_block_xy_mm"] == pytest.approx(told["rmse_true_xy_mm"])
     assert told["rmse_of_exact_block_z_mm"] == pytest.approx(told["rmse_true_z_mm"])
+
+
+@pytest.mark.parametrize("stills, video, complete", [(2, True, True), (1, True, False), (2, False, False)])
+def test_flight_is_rendered_when_all_its_files_are_there(
+    tmp_path: Path, stills: int, video: bool, complete: bool
+) -> None:
+    assert not rendered(tmp_path)
+    for folder in ("stills", "truth"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "truth" / "truth.json").write_text(json.dumps({"exposures": [{}, {}], "video": {}}))
+    for number in range(stills):
+        (tmp_path / "stills" / f"{number}.JPG").touch()
+    if video:
+        (tmp_path / "video.avi").touch()
+    assert rendered(tmp_path) is complete
 
 
 def test_ground_cells_hold_the_points_within_half_a_metre() -> None:
