@@ -91,6 +91,8 @@ def test_nadir_stills_over_flat_ground_invite_doming(result: OrientedBlock) -> N
     points = result.adjustment.points_m * [1.0, 1.0, 0.01]
     flat = adjusted(result, points_m=points)
     assert words in said(flat, Weight.WATCH)
+    uncontrolled = adjusted(flat, control_used=np.zeros_like(flat.adjustment.control_used))
+    assert "badly determined" in said(uncontrolled, Weight.LIMIT)
     two_heights = result.adjustment.projection_centres_m + np.array([0.0, 0.0, 6.0]) * (np.arange(8) % 2)[:, None]
     assert words not in said(adjusted(flat, projection_centres_m=two_heights))
 

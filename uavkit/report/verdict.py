@@ -235,22 +235,28 @@ def _doming(result: OrientedBlock) -> Iterator[Remark]:
             yield limit(f"{text}: the block is domed.")
         else:
             yield good(f"{text}: no doming found.")
-    sigma = predicted_bow_sigma_m(result)
-    if np.isfinite(sigma):
-        size = f"{1e3 * sigma:.1f} {unit.thousandth} ({sigma / result.gsd_m:.1f} GSD)"
-        if sigma > WEAK_BOW_GSD * result.gsd_m:
-            yield limit(
-                f"The heights are badly determined: a bow from the centre of the block to its edge has a predicted "
-                f"sigma of {size}, and no residual would show it. Control in the middle and at the edges, some oblique "
-                f"stills or a second height would fix it."
-            )
-        else:
-            yield good(f"A bow of the block from its centre to its edge has a predicted sigma of {size}.")
-    elif _invites_doming(result):
-        yield watch(
-            "All stills look straight down from one height over flat ground: such a block invites doming. Control in "
-            "the middle and at the edges, a few oblique stills or a second height would prevent it."
+    yield from _curvature(result)
+
+
+def _curvature(result: OrientedBlock) -> Iterator[Remark]:
+    """Tell how well the observations determine the curvature of the block."""
+    sigma, unit = predicted_bow_sigma_m(result), length_unit(result)
+    size = f"{1e3 * sigma:.1f} {unit.thousandth} ({sigma / result.gsd_m:.1f} GSD)"
+    remedy = "Control in the middle and at the edges, some oblique stills or a second height would fix it."
+    if _invites_doming(result):
+        weight = watch if np.any(result.adjustment.control_used) else limit
+        model = f"only as far as the lens follows its model does the predicted sigma of such a bow, {size}, hold"
+        yield weight(
+            "The heights are badly determined: all stills look straight down from one height over flat ground, and "
+            f"such a block invites doming{f'; {model}' if np.isfinite(sigma) else ''}. {remedy}"
         )
+    elif sigma > WEAK_BOW_GSD * result.gsd_m:
+        yield limit(
+            f"The heights are badly determined: a bow from the centre of the block to its edge has a predicted sigma "
+            f"of {size}, and no residual would show it. {remedy}"
+        )
+    elif np.isfinite(sigma):
+        yield good(f"A bow of the block from its centre to its edge has a predicted sigma of {size}.")
 
 
 def _invites_doming(result: OrientedBlock) -> bool:
