@@ -1,5 +1,6 @@
 """The factor by fronts against the dense one, and adjustments of larger blocks by both."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -110,6 +111,18 @@ def test_adjustment_is_that_of_the_dense_factor(monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_allclose(
         np.sqrt(np.einsum("nkk->nk", sparse.exterior_covariances)), sigma, rtol=1e-4
     )  # fmt: skip
+
+
+def test_result_does_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    block = simulate(np.random.default_rng(6), LARGE, start_error=0.1)
+    results = []
+    for threads in (1, 2):
+        with ThreadPoolExecutor(threads) as pool:
+            monkeypatch.setattr(bundle_system, "_pool", lambda process, pool=pool: pool)
+            results.append(adjust_block(block.observations, AdjustmentOptions(robust=False)))
+    for name in ("points_m", "exterior_covariances", "point_covariances_m2", "ray_redundancy", "interior_covariance"):
+        np.testing.assert_array_equal(getattr(results[0], name), getattr(results[1], name))
+    assert results[0].sigma0 == results[1].sigma0
 
 
 def test_defect_is_named() -> None:
