@@ -2,7 +2,7 @@
 
 Whoever solves them gives a ``ReducedFactor``: it solves, and returns the inverse at the pattern of the blocks, which is
 all that covariances of orientations and points and redundancy numbers need. ``factor_dense`` suits some hundred images;
-a sparse factorisation with a selected inverse (Takahashi 1973) fits behind the same two functions.
+``process.sparse_factor`` has the one for more.
 """
 
 from dataclasses import dataclass
