@@ -121,6 +121,8 @@ def ratio_of_means(name: str) -> Callable[[Rows, Rows], float]:
     def ratio(ours: Rows, peer: Rows) -> float:
         theirs = {row["case"]: row for row in peer}
         both = [row for row in ours if row["case"] in theirs]
+        if not both:
+            return float("nan")
         return float(values(both, name).mean() / values([theirs[row["case"]] for row in both], name).mean())
 
     return ratio
@@ -196,7 +198,7 @@ def judge(bar: Bar, rows: Mapping[str, Rows]) -> Judgement:
     """Compare a bar with the rows of each benchmark."""
     groups = [rows.get(name, ()) for name in bar.rows]
     there, needed = [min(len(g), n) for g, n in zip(groups, bar.rows.values(), strict=True)], sum(bar.rows.values())
-    measured = bar.measure(*groups) if all(there) else float("nan")
+    measured = bar.measure(*groups) if any(there) else float("nan")
     if sum(there) < needed or np.isnan(measured):
         return Judgement(bar=bar, measured=measured, verdict=f"{sum(there)} of {needed} rows")
     if not bar.text:

@@ -57,6 +57,7 @@ def test_ratio_of_means_takes_the_cases_that_both_have() -> None:
     ours = [row("a", error=2.0), row("b", error=4.0), row("c", error=1000.0)]
     peer = [row("b", error=8.0), row("a", error=4.0), row("d", error=1000.0)]
     assert ratio_of_means("error")(ours, peer) == pytest.approx(0.5)
+    assert np.isnan(ratio_of_means("error")(ours, []))
 
 
 def test_blocks_beyond_chi_square_are_counted() -> None:
