@@ -85,6 +85,13 @@ def smallest_share(name: str, of: str) -> Callable[[Rows], float]:
     return lambda rows: float((values(rows, name) / values(rows, of)).min())
 
 
+def growth(rows: Rows) -> float:
+    """Return the exponent with which processor time grows with the number of images, the name of the case; to 3000."""
+    images = np.array([float(row["case"]) for row in rows])
+    use = images <= 3000
+    return float(np.polyfit(np.log(images[use]), np.log(values(rows, "cpu_s")[use]), 1)[0]) if use.sum() > 1 else np.nan
+
+
 def spread_of(name: str) -> Callable[[Rows], float]:
     """Return the function that divides the largest of a value over rows by the smallest."""
     return lambda rows: float(values(rows, name).max() / values(rows, name).min())
@@ -172,6 +179,15 @@ BARS: tuple[Bar, ...] = (
         measure=largest_share("ours_peak_mb", "colmap_peak_mb"),
         most=1.0,
     ),
+    Bar(rows={"bundle speed": 4}, what="time over Ceres', largest", measure=largest("ratio"), most=0.5),
+    Bar(
+        rows={"bundle speed": 4},
+        what="peak memory over Ceres', largest",
+        measure=largest_share("ours_peak_mb", "ceres_peak_mb"),
+        most=1.0,
+    ),
+    Bar(rows={"bundle scaling": 5}, what="processor time grows with n to the power", measure=growth, most=1.3),
+    Bar(rows={"tracking speed": 4}, what="time over Lucas-Kanade's, median", measure=median_of("ratio")),
     Bar(rows={"matching speed": 2}, what="times as fast as ECC, least", measure=smallest("ratio")),
     Bar(rows={"rays": 4}, what="true over calibrated sigma, least", measure=smallest(CALIBRATED), least=0.75),
     Bar(rows={"rays": 4}, what="true over calibrated sigma, largest", measure=largest(CALIBRATED), most=1.25),
