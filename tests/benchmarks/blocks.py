@@ -15,7 +15,7 @@ from typing import Any
 
 from tests.benchmarks.evaluation import evaluated
 from tests.benchmarks.rows import WORK
-from tests.benchmarks.subprocesses import THREADS, Finished, run_measured
+from tests.benchmarks.subprocesses import THREADS, Finished, ProgramFailedError, run_measured
 from uavkit.core.errors import InputError
 from uavkit.formats.adjustment_file import read_oriented_block
 from uavkit.project import Project
@@ -155,13 +155,18 @@ def _log(case: Case, step: str) -> Path:
 
 
 def oriented(case: Case) -> dict[str, Any]:
-    """Take a case through the chain and return all that its row tells."""
-    began, done = ingest(case), process(case)
+    """Take a case through the chain and return all that its row tells; a chain that gives up has oriented nothing."""
+    truth = read_truth(render(case) / "truth" / "truth.json")
+    compile_kernels()
+    try:
+        began, done = ingest(case), process(case)
+    except ProgramFailedError as error:
+        return {"stills": len(truth["exposures"]), "stills_oriented": 0, "failure": error.last_line}
     result = read_oriented_block(Project(case.survey).result_file)
     return {
         "ingest_s": began.wall_s,
         "process_s": done.wall_s,
         "process_processor_s": done.processor_s,
         "peak_mb": done.peak_mb,
-        **evaluated(result, read_truth(case.flight / "truth" / "truth.json")),
+        **evaluated(result, truth),
     }

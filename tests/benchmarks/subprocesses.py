@@ -23,8 +23,17 @@ class Finished:
     said: str
 
 
+class ProgramFailedError(Exception):
+    """A program that ended with an error; ``last_line`` is what it said last."""
+
+    def __init__(self, arguments: Sequence[str], status: int, said: str) -> None:
+        """Word the error."""
+        self.last_line = said.strip().splitlines()[-1] if said.strip() else f"exit status {status}"
+        super().__init__(f"{' '.join(arguments)}: exit status {status}: {said[-2000:]}")
+
+
 def run_measured(arguments: Sequence[str], log: Path) -> Finished:
-    """Run ``python -m ARGUMENTS`` of this checkout, keep what it says in a file; raises RuntimeError where it fails."""
+    """Run ``python -m ARGUMENTS`` of this checkout, keep what it says in a file; raises ProgramFailedError where it fails."""
     log.parent.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "NO_COLOR": "1"}
     begin = time.perf_counter()
@@ -37,7 +46,7 @@ def run_measured(arguments: Sequence[str], log: Path) -> Finished:
     wall_s = time.perf_counter() - begin
     said = log.read_text(encoding="utf-8", errors="replace")
     if child.returncode:
-        raise RuntimeError(f"{' '.join(arguments)}: exit status {child.returncode}: {said[-2000:]}")
+        raise ProgramFailedError(arguments, child.returncode, said)
     bytes_per_unit = 1 if sys.platform == "darwin" else 1024
     return Finished(
         wall_s=wall_s,
