@@ -33,7 +33,10 @@ class ProgramFailedError(Exception):
 
 
 def run_measured(arguments: Sequence[str], log: Path) -> Finished:
-    """Run ``python -m ARGUMENTS`` of this checkout, keep what it says in a file; raises ProgramFailedError where it fails."""
+    """Run ``python -m ARGUMENTS`` of this checkout and keep what it says in a file.
+
+    Raises ProgramFailedError where it ends with an error.
+    """
     log.parent.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "NO_COLOR": "1"}
     begin = time.perf_counter()
