@@ -105,19 +105,27 @@ def common(
         os.environ["UAVKIT_DEBUG"] = "1"
 
 
+Terrain = Annotated[
+    Literal["embankment", "hills", "flat"], typer.Option(help="A crest of 10 m, rolling ground, or a plane.")
+]
+Texture = Annotated[
+    Literal["mixed", "repetitive", "low_contrast"],
+    typer.Option(help="Grass, gravel and soil in the sun; rows of like plants; raked sand without shadows."),
+]
+Outliers = Annotated[
+    int | None,
+    typer.Option(help="Positions that are off by 12 to 30 m; else one for every 11 stills up to 3, with RTK none."),
+]
+
+
 @app.command()
 def simulate(
     out: Annotated[Path, typer.Argument(help="New folder for the simulated flight.", show_default=False)],
     flight: Annotated[
         Literal["constant", "trace"], typer.Option(help="One height, or following the ground.")
     ] = "constant",
-    terrain: Annotated[
-        Literal["embankment", "hills", "flat"], typer.Option(help="A crest of 10 m, rolling ground, or a plane.")
-    ] = "embankment",
-    texture: Annotated[
-        Literal["mixed", "repetitive", "low_contrast"],
-        typer.Option(help="Grass, gravel and soil in the sun; rows of like plants; raked sand without shadows."),
-    ] = "mixed",
+    terrain: Terrain = "embankment",
+    texture: Texture = "mixed",
     brightness_jump: Annotated[
         float, typer.Option(help="How much longer every second still is exposed, 0 to 0.6 (0.4: 40 %).")
     ] = 0.0,
@@ -136,10 +144,7 @@ def simulate(
     gnss_sigma: Annotated[
         float, typer.Option(help="Noise of the positions for each axis, m, 0 to 10; below 0.1 it is RTK.")
     ] = 1.0,
-    gnss_outliers: Annotated[
-        int | None,
-        typer.Option(help="Positions that are off by 12 to 30 m; else one for every 11 stills up to 3, with RTK none."),
-    ] = None,
+    gnss_outliers: Outliers = None,
     control_points: Annotated[int, typer.Option(help="Ground control points, 0 to 20.")] = 3,
     seed: Annotated[int, typer.Option(help="Of everything that is random.")] = 1,
     workers: Workers = CORES,

@@ -1,5 +1,9 @@
 """The store of decoded stills: what it keeps and what it forgets."""
 
+import platform
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -47,3 +51,25 @@ def test_two_stills_stay_however_large_they_are() -> None:
 def test_colours_for_grey_values_are_refused() -> None:
     with pytest.raises(InputError, match=r"0.JPG.*\(height, width\)"):
         PictureStore(_stills(1, (10, 10, 3)), ("0.JPG",)).grey(0)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library gives memory back in its own way")
+def test_freed_pictures_go_back_to_the_system() -> None:
+    """In a process of its own: pictures made and freed by threads, with small things kept in between."""
+    program = """
+import numpy as np
+from concurrent.futures import ThreadPoolExecutor
+from uavkit.process.pictures import return_freed_memory
+return_freed_memory()
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * 4096
+before, kept = resident(), []
+def work(number):
+    pictures = [np.ones((3000, 2000 + 100 * (number % 7)), np.uint8) for _ in range(3)]
+    kept.append(np.ones(10_000))
+with ThreadPoolExecutor(4) as pool:
+    list(pool.map(work, range(60)))
+print(resident() - before - sum(each.nbytes for each in kept))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 20e6  # not one picture

@@ -39,7 +39,7 @@ from uavkit.process.network import (
     without_weak_stills,
 )
 from uavkit.process.options import CandidateSource, ProcessOptions
-from uavkit.process.pictures import PictureStore, PyramidStore
+from uavkit.process.pictures import PictureStore, PyramidStore, return_freed_memory
 from uavkit.process.ray_sigma import SigmaCalibration
 from uavkit.process.summary import Findings, peak_memory_mb, summarise
 from uavkit.process.thinning import points_apart
@@ -94,6 +94,7 @@ def orient_block(
     names = tuple(still.name for still in block.stills)
     if len(names) < 2:
         raise InputError(f"a block needs at least 2 stills, there are {len(names)}")
+    return_freed_memory()
     store = PictureStore(stills, names)
     place = Workplace(
         block=block,

@@ -1,13 +1,30 @@
 """Grey values of the stills in use, a few at a time: memory does not grow with the number of stills."""
 
+import ctypes
 from collections import OrderedDict
-from functools import lru_cache
+from functools import cache, lru_cache
 from threading import Lock
 
 from uavkit.core.arrays import Image
 from uavkit.core.devices import StillSource
 from uavkit.core.errors import InputError
 from uavkit.process.pyramid import ImagePyramid, build_pyramid
+
+_M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8  # of glibc's malloc.h
+_LARGE_BYTES = 4 * 2**20
+
+
+@cache
+def return_freed_memory() -> None:
+    """Let the C library give large blocks back to the system as soon as they are freed, where it is glibc.
+
+    By itself it keeps them once some were freed, in heaps of each thread that picture after picture breaks up: 80
+    stills of 12 megapixels then took 4.0 GB instead of 1.6 GB, and each further one 44 MB more.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
+        mallopt(_M_ARENA_MAX, 2)
 
 
 class PictureStore:

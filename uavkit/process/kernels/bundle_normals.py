@@ -263,6 +263,38 @@ def weighted_squares(
 
 
 @summing_kernel
+def _by_interior(
+    line: Array,
+    factor: tuple[float, float],
+    interior: Array,
+    ideal: tuple[float, float],
+    distorted: tuple[float, float],
+) -> None:
+    """Write the whitened derivatives (2, 10) of an image point by its interior orientation."""
+    f0, f1 = factor
+    x, y = ideal
+    xd, yd = distorted
+    c, b1, b2 = interior[0], interior[8], interior[9]
+    r2 = x * x + y * y
+    f0c, f1c = f0 * c, f1 * c
+    line[0, 0], line[1, 0] = f0 * ((1.0 + b1) * xd + b2 * yd), f1 * yd
+    line[0, 1], line[1, 1], line[0, 2], line[1, 2] = f0, 0.0, 0.0, f1
+    column, row, power = f0c * ((1.0 + b1) * x + b2 * y), f1c * y, r2
+    line[0, 3], line[1, 3] = power * column, power * row
+    power *= r2
+    line[0, 4], line[1, 4] = power * column, power * row
+    power *= r2
+    line[0, 5], line[1, 5] = power * column, power * row
+    line[0, 6], line[1, 6] = (
+        f0c * ((1.0 + b1) * 2.0 * x * y + b2 * (r2 + 2.0 * y * y)), f1c * (r2 + 2.0 * y * y)
+    )  # fmt: skip
+    line[0, 7], line[1, 7] = (
+        f0c * ((1.0 + b1) * (r2 + 2.0 * x * x) + b2 * 2.0 * x * y), f1c * 2.0 * x * y
+    )  # fmt: skip
+    line[0, 8], line[1, 8], line[0, 9], line[1, 9] = f0c * xd, 0.0, f0c * yd, 0.0
+
+
+@summing_kernel
 def linearise_point(rays: RayTable, unknowns: Unknowns, weight: Array, free: Free, p: int, out: Equations) -> int:
     """Write the whitened observation equations of a point's rays of weight above zero; return how many there are.
 
@@ -305,36 +337,18 @@ def linearise_point(rays: RayTable, unknowns: Unknowns, weight: Array, free: Fre
         out.misclosure[count, 0] = f0 * (rays.xy_px[ray, 0] - column)
         out.misclosure[count, 1] = f1 * (rays.xy_px[ray, 1] - row)
         for axis in range(2):
+            by_x, by_y = f1 * c * cross, f1 * c * yy
             if axis == 0:
                 by_x, by_y = f0 * c * ((1.0 + b1) * xx + b2 * cross), f0 * c * ((1.0 + b1) * cross + b2 * yy)
-            else:
-                by_x, by_y = f1 * c * cross, f1 * c * yy
             by_u, by_v, by_w = -by_x * by_depth, by_y * by_depth, -(by_x * x + by_y * y) * by_depth
-            bp0, bp1, bp2 = (
-                by_u * r00 + by_v * r01 + by_w * r02, by_u * r10 + by_v * r11 + by_w * r12,
-                by_u * r20 + by_v * r21 + by_w * r22,
-            )  # fmt: skip
+            bp0, bp1 = by_u * r00 + by_v * r01 + by_w * r02, by_u * r10 + by_v * r11 + by_w * r12
+            bp2 = by_u * r20 + by_v * r21 + by_w * r22
             out.by_point[count, axis, 0], out.by_point[count, axis, 1], out.by_point[count, axis, 2] = bp0, bp1, bp2
             line_image = out.by_image[count, axis]
             line_image[0], line_image[1], line_image[2] = -bp0, -bp1, -bp2
             line_image[3], line_image[4], line_image[5] = by_v * w - by_w * v, by_w * u - by_u * w, by_u * v - by_v * u
         if own + shared > 0:
-            f0c, f1c = f0 * c, f1 * c
-            line[0, 0], line[1, 0] = f0 * ((1.0 + b1) * xd + b2 * yd), f1 * yd
-            line[0, 1], line[1, 1], line[0, 2], line[1, 2] = f0, 0.0, 0.0, f1
-            column, row, power = f0c * ((1.0 + b1) * x + b2 * y), f1c * y, r2
-            line[0, 3], line[1, 3] = power * column, power * row
-            power *= r2
-            line[0, 4], line[1, 4] = power * column, power * row
-            power *= r2
-            line[0, 5], line[1, 5] = power * column, power * row
-            line[0, 6], line[1, 6] = (
-                f0c * ((1.0 + b1) * 2.0 * x * y + b2 * (r2 + 2.0 * y * y)), f1c * (r2 + 2.0 * y * y)
-            )  # fmt: skip
-            line[0, 7], line[1, 7] = (
-                f0c * ((1.0 + b1) * (r2 + 2.0 * x * x) + b2 * 2.0 * x * y), f1c * 2.0 * x * y
-            )  # fmt: skip
-            line[0, 8], line[1, 8], line[0, 9], line[1, 9] = f0c * xd, 0.0, f0c * yd, 0.0
+            _by_interior(line, (f0, f1), interior[g], (x, y), (xd, yd))
             if groups > 1:
                 out.by_border[count] = 0.0
             for axis in range(2):
