@@ -21,7 +21,7 @@ from uavkit.process.orientation_code import CODE_COUNT, orientation_codes, richn
 from uavkit.process.pyramid import ImagePyramid, full_from_level
 from uavkit.process.tie_points import ObjectGeometry
 
-CELLS = 1.5
+CELLS = 1.75
 """Cells of a still in which a point is wanted, along its longer side, for each cell of ``CandidateOptions``."""
 PER_CELL = 3
 _DETECTION_LEVEL = 2
