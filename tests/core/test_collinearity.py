@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from uavkit.core.angles import rotation_from_vector
 from uavkit.core.arrays import Array
-from uavkit.core.camera import InteriorOrientation
+from uavkit.core.camera import InteriorOrientation, pixels_from_ideal
 from uavkit.core.collinearity import collinearity_derivatives, image_coordinates, inside_image, object_rays
 from uavkit.core.orientation import ExteriorOrientation, image_space_coordinates
 
@@ -134,3 +134,18 @@ def test_an_orientation_refuses_what_is_no_rotation() -> None:
 
 def test_angles_of_an_orientation_are_those_that_made_it() -> None:
     assert TILTED.omega_phi_kappa == pytest.approx((0.1, -0.2, 2.5))
+
+
+def test_points_far_outside_are_not_folded_back_into_the_image() -> None:
+    """With k1 < 0 the distorted radius falls again beyond a limit: 75 degrees off the axis it would be in the image."""
+    interior = InteriorOrientation(
+        width_px=4000, height_px=3000, principal_distance_px=2684.0, x0_px=1999.5, y0_px=1499.5, k1=-0.06
+    )
+    down = ExteriorOrientation(projection_centre_m=np.array([0.0, 0.0, 15.0]), R_object_from_image=np.eye(3))
+    tangents = np.array([0.3, 0.7, 3.9])
+    points = np.column_stack([15.0 * tangents, np.zeros(3), np.zeros(3)])
+    folded = pixels_from_ideal(np.column_stack([tangents, np.zeros(3)]), interior)
+    assert inside_image(folded, interior).tolist() == [True, True, True]
+    xy = image_coordinates(points, down, interior)
+    np.testing.assert_allclose(xy[:2], folded[:2])
+    assert np.isnan(xy[2]).all()

@@ -14,13 +14,24 @@ from uavkit.core.camera import (
 )
 from uavkit.core.orientation import ExteriorOrientation, image_space_coordinates
 
+FARTHEST = 2.0
+"""Times the distance of the farthest corner from the principal point."""
+
 
 def image_coordinates(points_m: Array, exterior: ExteriorOrientation, interior: InteriorOrientation) -> Array:
-    """Project object points, shape (n, 3), to (column, row) in pixels, shape (n, 2); NaN behind the camera."""
+    """Project object points, shape (n, 3), to (column, row) in pixels, shape (n, 2).
+
+    NaN behind the camera, and beyond ``FARTHEST`` times the corner of the image: out there the polynomial of the
+    distortion holds no longer, and may fold points back into the image.
+    """
     u, v, w = image_space_coordinates(points_m, exterior).T
+    corner_px = np.hypot(
+        max(interior.x0_px, interior.width_px - 1 - interior.x0_px),
+        max(interior.y0_px, interior.height_px - 1 - interior.y0_px),
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         ideal = np.column_stack([-u / w, v / w])
-    ideal[w >= 0] = np.nan
+        ideal[(w >= 0) | (np.hypot(*ideal.T) > FARTHEST * corner_px / interior.principal_distance_px)] = np.nan
     return pixels_from_ideal(ideal, interior)
 
 
