@@ -16,7 +16,7 @@ import csv
 import io
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
@@ -29,6 +29,7 @@ from uavkit.core.frames import LocalFrame, ellipsoid_heights_m, geographic_from_
 from uavkit.core.heights import HeightDatum
 from uavkit.core.points import CheckPoint, ImageMark, SurveyedPoint
 from uavkit.formats.atomic import write_text
+from uavkit.formats.commented_csv import comment_keys, rows_of_cells
 
 COLUMNS = (
     "name",
@@ -278,7 +279,7 @@ def _odm_row(path: Path, number: int, line: str, options: ControlFileOptions) ->
 
 
 def _read_csv(path: Path, lines: Sequence[str], options: ControlFileOptions) -> SurveyedPoints:
-    keys = _csv_keys(path, lines)
+    keys = comment_keys(path, lines, _KEYS)
     if "crs" not in keys:
         raise InputError(f"{path}: states no CRS: write a line like '# crs: EPSG:32654' above the header")
     _check_crs(path, keys["crs"][0], keys["crs"][1])
@@ -288,47 +289,22 @@ def _read_csv(path: Path, lines: Sequence[str], options: ControlFileOptions) -> 
         vertical = _choice(path, *keys["vertical"], {d.value: d for d in (HeightDatum.ELLIPSOID, HeightDatum.GEOID)})
     if "pixel" in keys:
         origin = _choice(path, *keys["pixel"], {item.value: item for item in PixelOrigin})
-    rows = [_csv_row(f"{path}: line {number}", number, cells, options) for number, cells in _csv_cells(path, lines)]
+    rows = [
+        _csv_row(f"{path}: line {number}", number, cells, options)
+        for number, cells in rows_of_cells(path, lines, _check_header)
+    ]
     return SurveyedPoints(
         crs=keys["crs"][1], vertical=vertical, pixel_origin=origin, points=_grouped(path, rows), source=str(path)
     )
 
 
-def _csv_keys(path: Path, lines: Sequence[str]) -> dict[str, tuple[int, str]]:
-    """Return the keys in comment lines, each with its line number; a key that is nearly a known one is an error."""
-    keys: dict[str, tuple[int, str]] = {}
-    for number, line in enumerate(lines, start=1):
-        found = re.match(r"\s*#\s*(\w+)\s*:\s*(.*?)[\s,]*$", line)  # spreadsheets pad comments with commas
-        if found is None:
-            continue
-        key, value = found[1].lower(), found[2].strip().strip('"')
-        if key in _KEYS:
-            keys[key] = (number, value)
-        elif hint := did_you_mean(key, _KEYS):
-            raise InputError(f"{path}: line {number}: unknown key {key!r}{hint}")
-    return keys
-
-
-def _csv_cells(path: Path, lines: Sequence[str]) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield line number and cells by column of each row; checks the header."""
-    header: list[str] | None = None
-    for number, line in enumerate(lines, start=1):
-        if not line.strip(" ,\t") or line.lstrip().startswith("#"):
-            continue
-        cells = [cell.strip() for cell in next(csv.reader([line]))]
-        if header is None:
-            header = [cell.lower() for cell in cells]
-            for name in header:
-                if name not in COLUMNS:
-                    raise InputError(f"{path}: line {number}: unknown column {name!r}{did_you_mean(name, COLUMNS)}")
-            missing = [name for name in _NEEDED if name not in header]
-            if missing or len(set(header)) < len(header):
-                raise InputError(f"{path}: line {number}: the header needs each of {', '.join(_NEEDED)} once")
-            continue
-        if len(cells) != len(header):
-            hint = ": decimal commas are not accepted, write decimal points" if len(cells) > len(header) else ""
-            raise InputError(f"{path}: line {number} has {len(cells)} cells, the header {len(header)}{hint}")
-        yield number, dict(zip(header, cells, strict=True))
+def _check_header(where: str, header: list[str]) -> None:
+    for name in header:
+        if name not in COLUMNS:
+            raise InputError(f"{where}: unknown column {name!r}{did_you_mean(name, COLUMNS)}")
+    missing = [name for name in _NEEDED if name not in header]
+    if missing or len(set(header)) < len(header):
+        raise InputError(f"{where}: the header needs each of {', '.join(_NEEDED)} once")
 
 
 def _csv_row(where: str, number: int, cells: dict[str, str], options: ControlFileOptions) -> _Row:

@@ -15,7 +15,7 @@ import csv
 import io
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from uavkit.core.frames import geographic_from_crs, parse_crs
 from uavkit.core.heights import HeightDatum
 from uavkit.core.records import GnssFix
 from uavkit.formats.atomic import write_text
+from uavkit.formats.commented_csv import comment_keys, rows_of_cells
 
 _GEOGRAPHIC = ("latitude_deg", "longitude_deg")
 _PROJECTED = ("easting_m", "northing_m")
@@ -56,7 +57,7 @@ class ImagePositions:
 def read_image_positions(path: Path) -> ImagePositions:
     """Read the CSV; raises InputError naming file and line for whatever cannot be understood."""
     lines = _lines(path)
-    keys, rows = _keys(path, lines), list(_rows(path, lines))
+    keys, rows = comment_keys(path, lines, _KEYS), list(rows_of_cells(path, lines, _check_header))
     if not rows:
         raise InputError(f"{path}: the file holds no position below its header")
     _refuse_doubles(path, rows)
@@ -103,38 +104,7 @@ def _lines(path: Path) -> list[str]:
         raise InputError(f"{path}: is no UTF-8 text (byte {error.start}): save it as UTF-8") from error
 
 
-def _keys(path: Path, lines: Sequence[str]) -> dict[str, tuple[int, str]]:
-    """Return the keys in comment lines, each with its line number; a key that is nearly a known one is an error."""
-    keys: dict[str, tuple[int, str]] = {}
-    for number, line in enumerate(lines, start=1):
-        found = re.match(r"\s*#\s*(\w+)\s*:\s*(.*?)[\s,]*$", line)  # spreadsheets pad comments with commas
-        if found is None:
-            continue
-        key, value = found[1].lower(), found[2].strip().strip('"')
-        if key in _KEYS:
-            keys[key] = (number, value)
-        elif hint := did_you_mean(key, _KEYS):
-            raise InputError(f"{path}: line {number}: unknown key {key!r}{hint}")
-    return keys
-
-
-def _rows(path: Path, lines: Sequence[str]) -> Iterator[_Row]:
-    """Yield the rows; checks the header."""
-    header: list[str] | None = None
-    for number, line in enumerate(lines, start=1):
-        if not line.strip(" ,\t") or line.lstrip().startswith("#"):
-            continue
-        cells = [cell.strip() for cell in next(csv.reader([line]))]
-        if header is None:
-            header = _header(f"{path}: line {number}", [cell.lower() for cell in cells])
-            continue
-        if len(cells) != len(header):
-            hint = ": decimal commas are not accepted, write decimal points" if len(cells) > len(header) else ""
-            raise InputError(f"{path}: line {number} has {len(cells)} cells, the header {len(header)}{hint}")
-        yield number, dict(zip(header, cells, strict=True))
-
-
-def _header(where: str, header: list[str]) -> list[str]:
+def _check_header(where: str, header: list[str]) -> None:
     """Refuse a header with unknown, doubled or missing columns."""
     for name in header:
         if name not in _KNOWN:
@@ -149,7 +119,6 @@ def _header(where: str, header: list[str]) -> list[str]:
     if len(header) > len(needed):
         doubled = sorted({name for name in header if header.count(name) > 1 or name not in needed})
         raise InputError(f"{where}: each column is needed once, and one pair of coordinates: look at {doubled}")
-    return header
 
 
 def _refuse_doubles(path: Path, rows: Sequence[_Row]) -> None:
