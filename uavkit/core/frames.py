@@ -236,3 +236,41 @@ def geographic_from_crs(coordinates_m: Array, crs: str) -> Array:
     if np.any(bad):
         raise InputError(f"coordinates {given[bad][0]} do not fit {crs}: wrong CRS, or easting and northing swapped")
     return result[:, [1, 0, 2]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalMap:
+    """A transverse Mercator map about one place: true to scale there at one height, to 1e-6 within 9 km of it."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_ellipsoid_m: float = 0.0
+    """Where a metre of the map is a metre."""
+
+    @cached_property
+    def crs(self) -> str:
+        """The map's CRS as PROJ text; x is east, y is north, metres, the place has (0, 0)."""
+        scale = 1.0 + self.height_ellipsoid_m / 6371000.0
+        return (
+            f"+proj=tmerc +lat_0={float(self.latitude_deg)!r} +lon_0={float(self.longitude_deg)!r} "
+            f"+k_0={scale!r} +ellps=WGS84 +units=m +type=crs"
+        )
+
+    @cached_property
+    def _projection(self) -> pyproj.Proj:
+        return pyproj.Proj(self.crs)
+
+    def map_from_geographic(self, latitude_deg: Array, longitude_deg: Array) -> Array:
+        """Return x, y in metres, shape (n, 2), of WGS 84 positions, each (n,)."""
+        x, y = self._projection(np.asarray(longitude_deg, float), np.asarray(latitude_deg, float), errcheck=True)
+        return np.column_stack([x, y])
+
+    def geographic_from_map(self, xy_m: Array) -> Array:
+        """Return latitude, longitude in degrees, shape (n, 2), of map positions (n, 2)."""
+        longitude, latitude = self._projection(xy_m[:, 0], xy_m[:, 1], inverse=True, errcheck=True)
+        return np.column_stack([latitude, longitude])
+
+    def convergence_rad(self, latitude_deg: Array, longitude_deg: Array) -> Array:
+        """Return the meridian convergence (n,): azimuth of the map's north, from true north, is minus this."""
+        factors = self._projection.get_factors(np.asarray(longitude_deg, float), np.asarray(latitude_deg, float))
+        return np.asarray(np.radians(factors.meridian_convergence))
