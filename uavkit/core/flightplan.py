@@ -114,6 +114,8 @@ class PlannedExposures:
     R_map_from_image: Array
     """(n, 3, 3); map axes: east, north, up at the exposure."""
     heading_deg: Array
+    station: NDArray[np.int64]
+    """Number of the exposure station; exposures that two sorties take have the same."""
     strip: NDArray[np.int64]
     sortie: NDArray[np.int64]
     time_s: Array
@@ -121,7 +123,8 @@ class PlannedExposures:
     forward_overlap: Array
     """Share of the image that the next one of its strip shows, 0 to 1; nan for the last of a strip."""
     side_overlap: Array
-    """The least share that a neighbouring strip shows; nan where there is none, or the area is not seen."""
+    """Share that the neighbouring strips of one side show: the lesser side where the middle of the image lies in the area,
+    the greater one where only its rim does; nan where there is no neighbour, or the area is not seen."""
     gsd_m: Array
     """(n, 3): least, mean and greatest ground distance of a pixel."""
     sees_area: NDArray[np.bool_]
