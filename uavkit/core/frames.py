@@ -92,7 +92,7 @@ def _best_is_available(crs_from: pyproj.CRS, crs_to: pyproj.CRS) -> bool:
         return bool(TransformerGroup(crs_from, crs_to, always_xy=True, allow_ballpark=False).best_available)
 
 
-def _transform(source: str, target: str, coordinates: Array) -> Array:
+def transformed(source: str, target: str, coordinates: Array) -> Array:
     """Transform (n, 3) coordinates, x or longitude first; raises InputError where what PROJ chose is not accurate."""
     transformer = _transformer(source, target)
     x, y, height = coordinates.T
@@ -184,7 +184,7 @@ class LocalFrame:
     def crs_from_enu(self, enu_m: Array) -> Array:
         """Return easting, northing and ellipsoidal height in the survey's CRS, shape (n, 3), of ENU (n, 3)."""
         geographic = self.geographic_from_enu(enu_m)
-        result = _transform(WGS84, _three_dimensional(self.crs), geographic[:, [1, 0, 2]])
+        result = transformed(WGS84, _three_dimensional(self.crs), geographic[:, [1, 0, 2]])
         if not _has_height(self.crs):
             result[:, 2] = geographic[:, 2]
         return result
@@ -226,10 +226,10 @@ def geographic_from_crs(coordinates_m: Array, crs: str) -> Array:
     given = np.asarray(coordinates_m, dtype=np.float64)
     source = _three_dimensional(crs)
     try:
-        result = _transform(source, WGS84, given)
+        result = transformed(source, WGS84, given)
         if not _has_height(crs):
             own_height = given[:, 2] + (given[:, 2] - result[:, 2])
-            result = _transform(source, WGS84, np.column_stack([given[:, :2], own_height]))
+            result = transformed(source, WGS84, np.column_stack([given[:, :2], own_height]))
     except ProjError as error:
         raise InputError(f"coordinates do not fit {crs}: {error}") from error
     bad = ~np.all(np.isfinite(result), axis=1)

@@ -173,6 +173,8 @@ def read_request(path: Path) -> PlanRequest:
     request = read_toml(path, PlanRequest)
     if not request.name:
         request = request.model_copy(update={"name": path.stem})
+    if bool(request.area_file) == bool(request.areas):
+        raise InputError(f"{path}: give area_file or [[areas]], one of them")
     check_request(request, str(path))
     return request
 
@@ -182,8 +184,6 @@ def check_request(request: PlanRequest, where: str) -> None:
     imaging = request.imaging
     if (imaging.height_above_ground_m is None) == (imaging.gsd_mm is None):
         raise InputError(f"{where}: [imaging] give height_above_ground_m or gsd_mm, one of them")
-    if bool(request.area_file) == bool(request.areas):
-        raise InputError(f"{where}: give area_file or [[areas]], one of them")
     for pattern in ("corridor", "facade", "orbit"):
         if request.pattern == pattern and getattr(request, pattern) is None:
             raise InputError(f"{where}: the pattern {pattern} needs a table [{pattern}]")
