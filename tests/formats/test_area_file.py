@@ -195,6 +195,19 @@ def test_a_shapefile_with_two_outlines_puts_the_hole_where_it_belongs(tmp_path: 
     assert_same(second, SQUARE, HOLE)
 
 
+@pytest.mark.parametrize(
+    "cpg, codec", [("UTF-8", "utf-8"), ("ISO-8859-1", "latin-1"), ("1252", "cp1252"), ("", "utf-8")]
+)
+def test_names_in_the_encoding_that_the_shapefile_states(tmp_path: Path, cpg: str, codec: str) -> None:
+    path = tmp_path / "a.shp"
+    with shapefile.Writer(str(path), shapeType=shapefile.POINT, encoding=codec) as writer:
+        writer.field("NAME", "C", 40)
+        writer.point(139.0, 35.0)
+        writer.record("Böschung")
+    path.with_suffix(".cpg").write_text(cpg)
+    assert read_areas(path)[0].name == "Böschung"
+
+
 def test_shapefile_lines_points_and_heights(tmp_path: Path) -> None:
     with shapefile.Writer(str(tmp_path / "l.shp"), shapeType=shapefile.POLYLINEZ) as writer:
         writer.field("ID", "N")
@@ -227,6 +240,13 @@ def test_wkt_with_and_without_srid(tmp_path: Path) -> None:
     assert_same(areas[1], [(139.0, 35.0), (139.01, 35.0), (139.0, 35.01)])
     assert_same(areas[2], SQUARE, HOLE, atol=1e-9)
     assert [a.kind for a in areas[3:]] == [AreaKind.LINE, AreaKind.LINE, AreaKind.POINT]
+
+
+def test_every_area_has_a_name_of_its_own(tmp_path: Path) -> None:
+    names = ["a", "a (2)", "a", "", "a", "area 4", "area 4"]
+    features = [feature(geojson_polygon(SQUARE), name=name) for name in names]
+    found = [area.name for area in read_areas(write(tmp_path, collection(*features), "a.json"))]
+    assert found == ["a", "a (2)", "a (3)", "area 4", "a (4)", "area 4 (2)", "area 4 (3)"]
 
 
 def test_repeated_vertices_are_dropped_the_outline_stays(tmp_path: Path) -> None:

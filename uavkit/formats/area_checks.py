@@ -33,20 +33,21 @@ class Outline:
 def checked_areas(outlines: list[Outline], source: str) -> tuple[SurveyArea, ...]:
     """Return the areas of a source, each with a name of its own; raises InputError naming source, area and place."""
     areas: list[SurveyArea] = []
+    taken: dict[str, int] = {}
     for number, outline in enumerate(outlines, start=1):
         given = " ".join(outline.name.split())
         where = f"{source}: area {number}" + (f" ({given!r})" if given else "")
-        name = _own_name(given or f"area {number}", {area.name for area in areas})
-        areas.append(_checked_area(outline, name, where))
+        areas.append(_checked_area(outline, _own_name(given or f"area {number}", taken), where))
     return tuple(areas)
 
 
-def _own_name(name: str, taken: set[str]) -> str:
-    """Return the name, with a number behind it where another area has it already."""
-    number, own = 1, name
+def _own_name(name: str, taken: dict[str, int]) -> str:
+    """Return the name, with a number behind it where another area has it; ``taken`` counts the areas of each name."""
+    own = name
     while own in taken:
-        number += 1
-        own = f"{name} ({number})"
+        taken[name] += 1
+        own = f"{name} ({taken[name]})"
+    taken[own] = 1
     return own
 
 

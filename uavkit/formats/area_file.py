@@ -5,6 +5,7 @@ the ``.prj`` beside it; WKT says it as ``SRID=...;`` before the geometry, x (lon
 word the coordinates must be plausible degrees. Heights are dropped. Each part of a Multi geometry is an own area.
 """
 
+import codecs
 import io
 import json
 import re
@@ -12,6 +13,7 @@ import struct
 import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -271,7 +273,7 @@ def _geojson_outline(kind: AreaKind, coordinates: list[Any], name: str, where: s
 
 # Shapefile
 
-_SHAPEFILE_FAULTS = (struct.error, ValueError, IndexError, KeyError, TypeError, OverflowError, AssertionError, OSError)
+_SHAPEFILE_FAULTS = (struct.error, ValueError, LookupError, TypeError, OverflowError, AssertionError, OSError)
 _POINTS, _LINES, _POLYGONS, _MULTIPOINTS = (1, 11, 21), (3, 13, 23), (5, 15, 25), (8, 18, 28)
 _NULL_SHAPE = 0
 
@@ -335,9 +337,19 @@ def _shapefile_names(path: Path, count: int) -> list[str]:
     beside = next((p for p in (path.with_suffix(".dbf"), path.with_suffix(".DBF")) if p.is_file()), None)
     if beside is None:
         return [""] * count
-    table = shapefile.Reader(dbf=io.BytesIO(beside.read_bytes()), encodingErrors="replace")
+    content = io.BytesIO(beside.read_bytes())
+    table = shapefile.Reader(dbf=content, encoding=_encoding(path.with_suffix(".cpg")), encodingErrors="replace")
     names = [_name(record.as_dict()) for record in table.iterRecords()]
     return (names + [""] * count)[:count]
+
+
+def _encoding(path: Path) -> str:
+    """Return the encoding that a ``.cpg`` file names, like UTF-8, ISO-8859-1 or 1252; else UTF-8."""
+    name = path.read_bytes()[:40].decode("latin-1").strip() if path.is_file() else ""
+    for candidate in (name, f"cp{name.removeprefix('ANSI ')}"):
+        with suppress(LookupError, ValueError):
+            return codecs.lookup(candidate).name
+    return "utf-8"
 
 
 def _degrees(xy: Array, crs: str, where: str) -> Array:

@@ -134,6 +134,7 @@ def _window(path: Path, extent: GridExtent, around: Around | None) -> Window:
             f"{path}: an elevation model needs 2 x 2 nodes, this has {extent.shape[0]} x {extent.shape[1]}"
         )
     try:
+        extent.bounds_deg()  # a CRS without an exact transformation is told here
         window = extent.whole() if around is None else window_around(extent, around)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
