@@ -97,7 +97,7 @@ def build_block(
     stills = tuple(info for info in listed if info.name in prepared.pictures)
     if missing:
         notes += (f"{len(missing)} stills cannot be read and are left out: {_reasons(missing)}",)
-    notes += check_overlap(stills, prepared.pictures)
+    notes += check_overlap(stills, prepared.pictures, sources.video)
     sync, sync_notes = _video(sources.video, stills, prepared, options, progress)
     joined = _positions(sources.positions, stills, tuple(missing), options)
     control = _marked(sources.control, stills, tuple(missing))

@@ -311,6 +311,106 @@ def window_correspondences(
     return np.array(frame).reshape(-1, 2), np.array(still).reshape(-1, 2)
 
 
+TONE_SIZE = (160, 120)
+TONE_BAND = (2.0, 10.0)
+"""Smoothing, and smoothing taken off, of pictures of ``TONE_SIZE``: standard deviations, pixels."""
+TONE_RIM = 8
+"""By so many pixels of ``TONE_SIZE`` the camera may have moved between the picture and the exposure."""
+LEAST_TONE = 0.4
+"""Standard deviation of tone, grey values, below which a picture shows none."""
+
+
+def tone(lines: Image) -> NDArray[np.float32]:
+    """Return what a picture shows without detail and without wide shading, of ``TONE_SIZE``.
+
+    It tells places apart where all detail looks alike, as in rows of plants, or is too faint to be described.
+    """
+    import cv2
+
+    small = cv2.resize(lines, TONE_SIZE, interpolation=cv2.INTER_AREA).astype(np.float32)
+    detail, wide = (cv2.GaussianBlur(small, (0, 0), sigma) for sigma in TONE_BAND)
+    return np.asarray(detail - wide, dtype=np.float32)
+
+
+def tone_likeness(picture: FieldPicture, reduced: ReducedStill, still_from_video: AffineTransformation) -> float | None:
+    """Return the highest correlation of tone of a still and a field shifted a little, None where there is no tone.
+
+    Some 0.9 for the same place, below 0.4 for another.
+    """
+    import cv2
+
+    rim = slice(TONE_RIM + 4, -TONE_RIM - 4)
+    still = tone(_still_in_field(picture, reduced, still_from_video))[rim, rim]
+    video = tone(picture.lines)[4:-4, 4:-4]
+    if min(float(still.std()), float(video.std())) < LEAST_TONE:
+        return None
+    return float(cv2.matchTemplate(video, still, cv2.TM_CCOEFF_NORMED).max())
+
+
+def transformation_by_tone(
+    pairs: Sequence[tuple[FieldPicture, ReducedStill]], nominal: AffineTransformation, middle: Array
+) -> AffineTransformation | None:
+    """Return the transformation in which still and field of most pairs have the same tone, None where they have not.
+
+    The finder shows the middle of the still by some scale, which is tried; each pair is then registered by the enhanced
+    correlation coefficient, and the median of all counts.
+    """
+    tried = []
+    for scale in np.arange(0.80, 1.101, 0.01):
+        shift = nominal.apply(middle[None])[0] - nominal.matrix @ middle * scale
+        one = AffineTransformation(matrix=nominal.matrix * scale, shift=shift)
+        likeness = [tone_likeness(picture, reduced, one) or 0.0 for picture, reduced in pairs]
+        tried.append((float(np.median(likeness)), one))
+    value, start = max(tried, key=lambda entry: entry[0])
+    if value < LEAST_LIKENESS:
+        return None
+    found = [_registered(picture, reduced, start) for picture, reduced in pairs]
+    known = [one for one in found if one is not None]
+    if 2 * len(known) < len(pairs) or not known:
+        return start
+    matrix = np.median([one.matrix for one in known], axis=0)
+    centre = np.median([one.apply(middle[None])[0] for one in known], axis=0)
+    return AffineTransformation(matrix=matrix, shift=centre - matrix @ middle)
+
+
+LEAST_LIKENESS = 0.6
+"""Median correlation of tone of pairs that belong together."""
+
+
+def _registered(
+    picture: FieldPicture, reduced: ReducedStill, start: AffineTransformation
+) -> AffineTransformation | None:
+    """Return still from video by the whole content of one pair, None where that does not converge."""
+    import cv2
+
+    still = _still_in_field(picture, reduced, start)
+    flat = [
+        (soft - cv2.GaussianBlur(soft, (0, 0), 12.0)).astype(np.float32)
+        for soft in (cv2.GaussianBlur(lines.astype(np.float32), (0, 0), 1.5) for lines in (picture.lines, still))
+    ]
+    end = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
+    try:
+        likeness, warp = cv2.findTransformECC(
+            flat[0], flat[1], np.eye(2, 3, dtype=np.float32), cv2.MOTION_AFFINE, end, np.full_like(still, 255), 5
+        )
+    except cv2.error:
+        return None
+    if likeness < LEAST_REGISTERED:
+        return None
+    # the warp is of the field's lines: warped still from field
+    step = np.array([1.0, float(picture.row_step)])
+    first = np.array([0.0, float(picture.first_row)])
+    matrix = step[:, None] * warp[:, :2] / step[None, :]
+    shift = first + step * warp[:, 2] - matrix @ first
+    return AffineTransformation(
+        matrix=start.matrix @ matrix, shift=start.apply(np.asarray(shift, dtype=np.float64)[None])[0]
+    )
+
+
+LEAST_REGISTERED = 0.3
+"""Correlation of a still and a field, finer detail included, that were brought together."""
+
+
 def _still_in_field(picture: FieldPicture, reduced: ReducedStill, still_from_video: AffineTransformation) -> Image:
     """Return the still as the field would show it, shape of the field."""
     import cv2

@@ -4,6 +4,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 
 from uavkit.core.camera import CameraProfile
+from uavkit.core.devices import VideoSource
 from uavkit.core.errors import InputError
 from uavkit.core.records import StillInfo
 from uavkit.ingest.still_matching import PreparedStill, share_content
@@ -74,10 +75,12 @@ def _is_of(still: StillInfo, camera: CameraProfile) -> bool:
     return not model or not known or any(name in model or model in name for name in known)
 
 
-def check_overlap(infos: Sequence[StillInfo], pictures: dict[str, PreparedStill]) -> tuple[str, ...]:
+def check_overlap(
+    infos: Sequence[StillInfo], pictures: dict[str, PreparedStill], video: VideoSource | None = None
+) -> tuple[str, ...]:
     """Return a note that names stills which share no content with their neighbours in time.
 
-    Raises InputError where no still shares content with any other.
+    Raises InputError where no still shares content with any other, unless a video can tell.
     """
     names = [info.name for info in infos]
     if len(names) < 2:
@@ -88,6 +91,8 @@ def check_overlap(infos: Sequence[StillInfo], pictures: dict[str, PreparedStill]
             if not (one in linked and two in linked) and share_content(pictures[one].features, pictures[two].features):
                 linked |= {one, two}
     if not linked and not _any_shared(names, pictures):
+        if video is not None:
+            return (f"the {len(names)} stills show too little detail to tell that they overlap: the video must",)
         raise InputError(
             f"no two of the {len(names)} stills show the same ground: they do not overlap, or belong to different "
             "places. A block needs at least 60 % forward overlap"

@@ -45,6 +45,8 @@ from uavkit.ingest.still_matching import (
     nominal_transformation,
     prepare_stills,
     robust_affine,
+    tone_likeness,
+    transformation_by_tone,
     window_correspondences,
 )
 
@@ -190,14 +192,14 @@ def _by_events(
     views = _event_views(scene, events)
     rough = _align(scene, events, np.zeros((len(scene.infos), len(events))))
     matches = _content_matches(scene, views, rough.matrix, progress)
-    common = _common(scene, matches, rough)
+    common = _common(scene, matches, rough) or _common_by_tone(scene, views, rough)
     if common is None:
         notes.append(
             f"video not used because its {len(events)} shutter events do not show what the stills show: "
             "is it the video of this flight?"
         )
         return SyncOutcome(sync=None, notes=tuple(notes))
-    evidence = _evidence(scene, views, matches, common)
+    evidence = _with_tone(scene, views, _evidence(scene, views, matches, common), (common, rough.matrix))
     alignment = _align(scene, events, evidence)
     pairs = [(int(i), int(j)) for i, j in alignment.pairs]
     certain = [(i, j) for i, j in pairs if evidence[i, j] > 0]
@@ -355,6 +357,41 @@ def _evidence(
     return evidence
 
 
+def _common_by_tone(scene: _Scene, views: list[_EventView], rough: SequenceAlignment) -> AffineTransformation | None:
+    """Return the transformation in which pairs that are sure by time have the same tone: detail may be too faint."""
+    pairs = [(views[j].picture, scene.stills[scene.infos[i].name].reduced) for i, j in rough.pairs.tolist()]
+    if len(pairs) < LEAST_BY_TONE:
+        return None
+    some = pairs[:: max(1, len(pairs) // MOST_BY_TONE)]
+    return transformation_by_tone(some, scene.nominal, scene.middle)
+
+
+LEAST_BY_TONE = 3
+MOST_BY_TONE = 8
+"""Pairs that give the transformation by tone."""
+TONE_EVIDENCE = ((0.4, 0.7), (-8.0, 8.0))
+"""Correlations of tone, and the evidence that they are."""
+
+
+def _with_tone(
+    scene: _Scene, views: list[_EventView], evidence: Array, known: tuple[AffineTransformation, Array]
+) -> Array:
+    """Return the evidence (n, m) with that of tone, for pairs that time leaves open.
+
+    Where all ground looks alike, detail finds no match for the right pair and may find one for a wrong: then tone
+    decides. It decides nothing where there is none.
+    """
+    common, likely = known
+    result = evidence.copy()
+    for i, j in np.argwhere(likely > 1e-5).tolist():
+        likeness = tone_likeness(views[j].picture, scene.stills[scene.infos[i].name].reduced, common)
+        if likeness is None:
+            continue
+        by_tone = float(np.interp(likeness, *TONE_EVIDENCE))
+        result[i, j] = min(evidence[i, j], by_tone) if evidence[i, j] > 0 else by_tone
+    return result
+
+
 def _transformation(
     scene: _Scene, views: list[_EventView], pairs: list[tuple[int, int]], start: tuple[AffineTransformation, float]
 ) -> tuple[AffineTransformation, float]:
@@ -378,6 +415,8 @@ def _transformation(
 def _own_residual_px(matches: Iterable[ContentMatch]) -> float:
     """Return the RMS of a coordinate's residual of matches in their own transformations, in still pixels."""
     residuals = [match.still_xy - match.still_from_video.apply(match.frame_xy) for match in matches]
+    if not residuals:
+        return float("nan")
     return float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
 
 
