@@ -4,11 +4,16 @@ Each picture is matched against the patches of the *first* one, warped by the ac
 errors do not add up; a patch is renewed only when its match decays. Positions are predicted from the motion
 so far. LMedS and the vote of the neighbours decide which matches hold, for on relief one affine
 transformation is not the truth (Anai et al. 2012, figure 7).
+
+On ground that repeats itself (rows of plants) a match tells little: each period looks alike. There pictures follow one
+another closely, and where nothing predicts the motion - after the shutter's black - it comes from what does not repeat:
+tone of wide extent first, then the dissimilarity of all points together. Alignments that this cannot tell apart are
+followed side by side until the pictures decide; where they do not, nothing is found.
 """
 
 from collections.abc import Iterable
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -36,6 +41,7 @@ from uavkit.process.orientation_code import (
     match_codes_at,
     packed_codes,
 )
+from uavkit.process.repetition import Tone, repeat_shifts, tone_costs, tone_of, wide_motion
 
 Grey = NDArray[np.uint8]
 
@@ -77,6 +83,10 @@ class TrackingOptions:
     most_misses: int = 12
     """Pictures running in which a point may go unseen before it is given up."""
     variant: Dissimilarity = Dissimilarity.PAPER
+    decisive_z: float = 4.0
+    """Difference of two alignments' dissimilarities over its standard deviation from which the worse is dropped."""
+    most_rivals: int = 4
+    """Alignments that are followed side by side where the ground repeats itself."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,6 +142,15 @@ class Source:
     threshold: int
 
 
+@dataclass(frozen=True, slots=True)
+class First:
+    """What is kept of the first picture where the ground repeats itself."""
+
+    source: Source
+    tone: Tone
+    """What does not repeat."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackState:
     """Everything known after a picture; advance() makes the next one."""
@@ -166,6 +185,15 @@ class TrackState:
     """Unusable pictures since the last usable one."""
     recent: tuple[Grey, ...] = ()
     """Small copies of the last pictures, to recognise a frozen one."""
+    repeats_px: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    """(k, 2) shifts at which the first picture repeats itself; none on ordinary ground."""
+    first: "First | None" = None
+    """The first picture; None on ordinary ground."""
+
+    @property
+    def repeats(self) -> bool:
+        """Whether the ground repeats itself."""
+        return len(self.repeats_px) > 0
 
 
 def start(
@@ -178,11 +206,13 @@ def start(
         raise InputError(f"tracking needs at least 6 points (n, 2), got {points.shape}")
     count = len(points)
     unit = np.tile(np.eye(2), (count, 1, 1))
+    repeats_px = repeat_shifts(picture.image)
+    source = Source(picture.image, coding_threshold(picture.image))
     return TrackState(
         options=chosen,
         neighbours=_neighbours(points, chosen.neighbours),
         start_px=points,
-        sources=(Source(picture.image, coding_threshold(picture.image)),),
+        sources=(source,),
         source_of=np.zeros(count, np.int64),
         source_px=points.copy(),
         source_warps=unit,
@@ -198,6 +228,8 @@ def start(
         time_s=picture.time_s,
         last_image=picture.image,
         recent=(_small(picture.image),),
+        repeats_px=repeats_px,
+        first=First(source, tone_of(picture.image)) if len(repeats_px) else None,
     )
 
 
@@ -255,16 +287,30 @@ def advance(
 
     The threads of a pool share the matching; the result is the same to the last bit.
     """
+    return _advanced(state, picture, rng, pool)[0]
+
+
+def _advanced(
+    state: TrackState, picture: TimedPicture, rng: np.random.Generator, pool: Executor | None
+) -> list[TrackState]:
+    """The state after a picture; several where the ground repeats itself and each may be right, the likeliest first."""
     if picture.image.shape != state.last_image.shape:
         raise InputError(f"picture size changed from {state.last_image.shape} to {picture.image.shape}")
     if not is_usable(state, picture):
-        return _blind(state)
+        return [_blind(state)]
     packed = packed_codes(picture.image)
     for attempt in _attempts(state, picture):
         found = _follow(state, packed, attempt, picture.time_s, rng, pool)
         if found is not None:
-            return _moved(state, picture, found)
-    return _blind(state)
+            return [_moved(state, picture, found)]
+    if state.repeats and (state.blind_pictures < _EAGER or state.blind_pictures % _EAGER == 0):
+        alignments = _alignments(state, picture, _Judge(packed, tone_of(picture.image), pool), rng)
+        return [_moved(state, picture, one.found) for one in alignments] or [_blind(state)]
+    return [_blind(state)]
+
+
+_EAGER = 4
+"""Pictures running that are searched for the place at any cost, on ground that repeats itself; then every fourth."""
 
 
 def _blind(state: TrackState) -> TrackState:
@@ -285,6 +331,13 @@ def _attempts(state: TrackState, picture: TimedPicture) -> Iterable[_Attempt]:
     """What to try in turn: the predicted motion (or the whole picture's shift), a wider search, a global one."""
     options = state.options
     usual = min(options.lost_radius_px, options.search_radius_px + state.blind_pictures // 2)
+    if state.repeats:
+        # a wider search, or the shift of the whole picture, would find another period as well
+        if state.motion is not None and picture.time_s - state.time_s < options.most_step_s:
+            yield _Attempt(
+                state.motion.over(picture.time_s - state.time_s), options.search_radius_px, options.least_share
+            )
+        return
     if state.motion is not None:
         motion = state.motion.over(picture.time_s - state.time_s)
         yield _Attempt(motion, usual, options.least_share)
@@ -338,6 +391,178 @@ def _follow(
     if step.inliers.sum() < max(6, 0.5 * attempt.least_share * visible.sum()):
         return None
     return _voted(state, matches, good, step.target_from_source, step.scale_px)
+
+
+@dataclass(frozen=True, slots=True)
+class _Judge:
+    """A picture by which alignments are judged."""
+
+    packed: Grey
+    tone: Tone
+    pool: Executor | None
+
+    def matches(self, state: TrackState, predicted: Array, motion: Array, radius_px: int) -> PointMatches:
+        """Match the points about predicted positions (n, 2)."""
+        return _match(state, self.packed, predicted, motion, np.full(len(predicted), radius_px, np.int64), self.pool)
+
+    def cost(self, state: TrackState, predicted: Array, motion: Array) -> Array:
+        """What each point costs at predicted positions, (n,): dissimilarity and tone; nan outside the picture."""
+        matches = self.matches(state, predicted, motion, 2)
+        outside = (matches.coded_share < 0) | np.isnan(matches.points_px[:, 0])
+        cost = np.where(outside, np.nan, np.minimum(matches.dissimilarity, 4.0))
+        if state.first is None:
+            return cost
+        warps = motion[:, :2] @ state.warps
+        tone = tone_costs(state.first.tone, self.tone, state.start_px, predicted, warps)
+        return np.asarray(cost + _TONE_WEIGHT * tone)
+
+
+_TONE_WEIGHT = 2.0
+"""Codes that tone without correlation is worth."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Alignment:
+    """One way in which a picture may show the points, with what each of these costs."""
+
+    motion: Array
+    cost: Array
+    found: _Found
+
+    @property
+    def mean(self) -> float:
+        """Of the cost of all points that the picture shows."""
+        return _mean_of(self.cost)
+
+
+def _mean_of(cost: Array) -> float:
+    known = cost[np.isfinite(cost)]
+    return float(known.mean()) if len(known) else float("inf")
+
+
+def _alignments(state: TrackState, picture: TimedPicture, judge: _Judge, rng: np.random.Generator) -> list[_Alignment]:
+    """All alignments of a picture that are about as good as the best, that first; on ground that repeats itself.
+
+    Tone of wide extent tells the motion to some pixels. About it, and at the shifts at which the ground repeats itself
+    about the best, all points together are compared: a single one fits at each period.
+    """
+    ways = _climbed(state, judge, _likely_motions(state, judge, wide_motion(state.last_image, picture.image)), rng)
+    kept: list[_Alignment] = []
+    for way in ways:
+        same = any(_median_distance(way.found.points_px, one.found.points_px) < _SAME_PX for one in kept)
+        if not same and (not kept or _z_of_worse(kept[0].cost, way.cost) < state.options.decisive_z):
+            kept.append(way)
+    return kept if len(kept) <= state.options.most_rivals else []
+
+
+def _climbed(state: TrackState, judge: _Judge, motions: list[Array], rng: np.random.Generator) -> list[_Alignment]:
+    """Alignments near motions (2, 3), and at the repetitions about the best until none is better; the best first."""
+    ways: list[_Alignment] = []
+    for _ in range(_MOST_CLIMBS):
+        best = ways[0].mean if ways else np.inf
+        fresh = (_refined(state, judge, motion, rng) for motion in motions)
+        ways = sorted([*ways, *(way for way in fresh if way is not None)], key=lambda way: way.mean)
+        if not ways or ways[0].mean >= best:
+            break
+        motions = [
+            ways[0].motion + np.column_stack([np.zeros((2, 2)), ways[0].motion[:, :2] @ state.affine[:, :2] @ shift])
+            for shift in _repeats_either_way(state.repeats_px)
+        ]
+    return ways
+
+
+_MOST_CLIMBS = 6
+_GRID_PX = np.arange(-9.0, 9.5, 3.0)
+"""About the motion that tone of wide extent tells, along columns and rows."""
+_LIKELY_SHIFTS = 6
+_JUDGING_POINTS = 250
+_SAME_PX = 2.0
+
+
+def _likely_motions(state: TrackState, judge: _Judge, motion: Array) -> list[Array]:
+    """The motions (2, 3), shifted over a grid, at which some of the points cost least."""
+    some = slice(None, None, max(1, len(state.points_px) // _JUDGING_POINTS))
+    part = replace(
+        state,
+        start_px=state.start_px[some],
+        source_of=state.source_of[some],
+        source_px=state.source_px[some],
+        source_warps=state.source_warps[some],
+        points_px=state.points_px[some],
+        warps=state.warps[some],
+    )
+    shifts = [np.array([[0, 0, column], [0, 0, row]]) for column in _GRID_PX for row in _GRID_PX]
+    costs = [
+        _mean_of(judge.cost(part, apply_affine(motion + shift, part.points_px), motion + shift)) for shift in shifts
+    ]
+    return [motion + shifts[index] for index in np.argsort(costs, kind="stable")[:_LIKELY_SHIFTS]]
+
+
+def _repeats_either_way(repeats_px: Array) -> list[Array]:
+    """Those of the shifts (k, 2) that differ, and the same backwards."""
+    apart: list[Array] = []
+    for shift in repeats_px:
+        if all(np.hypot(*(shift - other)) > 2 * _SAME_PX for other in apart):
+            apart.append(shift)
+    return [sign * shift for shift in apart for sign in (1, -1)]
+
+
+def _refined(state: TrackState, judge: _Judge, motion: Array, rng: np.random.Generator) -> _Alignment | None:
+    """An alignment near a motion (2, 3): matched in ever narrower searches about what neighbours agree on."""
+    options = state.options
+    predicted = apply_affine(motion, state.points_px)
+    for radius in (4, 4, 3, 3, 2):
+        matches = judge.matches(state, predicted, motion, radius)
+        good = np.asarray((matches.dissimilarity <= options.most_dissimilarity) & ~matches.on_rim)
+        visible = (matches.coded_share >= 0) & ~np.isnan(matches.points_px[:, 0])
+        if good.sum() < max(6, options.least_share * visible.sum()):
+            return None
+        try:
+            step = fit_affine_robustly(state.points_px[good], matches.points_px[good], rng)
+        except AdjustmentError:
+            return None
+        motion = step.target_from_source
+        expected = _bent(motion, state.points_px, matches.points_px, good)
+        medians, _, _ = _votes(matches.points_px - expected, good, state.neighbours)
+        predicted = expected + np.nan_to_num(medians)
+    found = _voted(state, matches, good, motion, step.scale_px)
+    return _Alignment(motion, judge.cost(state, predicted, motion), found)
+
+
+def _bent(motion: Array, points_px: Array, matched_px: Array, good: Flags) -> Array:
+    """Positions (n, 2) by a quadratic surface over those matches that hold: relief bends the motion of a picture.
+
+    Matches are taken in as the surface comes near them, from an affine motion (2, 3) on.
+    """
+    middle, size = points_px.mean(axis=0), np.ptp(points_px, axis=0) / 2 + 1.0
+    x, y = ((points_px - middle) / size).T
+    design = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+    expected = apply_affine(motion, points_px)
+    for _ in range(_BENDING_ROUNDS):
+        near = good & (np.hypot(*(matched_px - expected).T) <= _NEAR_PX)
+        if near.sum() < 4 * design.shape[1]:
+            return expected
+        solution, *_ = np.linalg.lstsq(design[near], matched_px[near], rcond=None)
+        expected = design @ solution
+    return np.asarray(expected)
+
+
+_BENDING_ROUNDS = 3
+_NEAR_PX = 2.5
+"""Of the surface so far: matches farther off are of another period."""
+
+
+def _median_distance(one_px: Array, two_px: Array) -> float:
+    return float(np.median(np.hypot(*(one_px - two_px).T)))
+
+
+def _z_of_worse(better: Array, worse: Array) -> float:
+    """Mean difference of two costs (n,) of the same points over its standard deviation."""
+    difference = worse - better
+    difference = difference[np.isfinite(difference)]
+    if len(difference) < 6:
+        return 0.0
+    return float(difference.mean() / max(float(difference.std()) / np.sqrt(len(difference)), 1e-9))
 
 
 def _match(
@@ -591,31 +816,80 @@ def track(
     there is no usable picture.
     """
     points = points_px if initial_affine is None else apply_affine(initial_affine, points_px)
-    state: TrackState | None = None
+    rivals: list[_Rival] = []
     waiting: TimedPicture | None = None
     for picture in pictures:
-        if state is None:
+        if not rivals:
             if picture.usable and _shows_something(_small(picture.image)):
-                state = start(picture, points, options, motion)
+                rivals = [_Rival(start(picture, points, options, motion))]
             continue
-        if _may_wait(state, picture):
+        if _may_wait(rivals[0].state, picture):
             waiting = picture
             continue
-        before = state
-        state = advance(state, picture, rng, pool)
-        if state.time_s == before.time_s and waiting is not None:
+        before_s = rivals[0].state.time_s
+        rivals = _followed(rivals, picture, rng, pool)
+        if rivals[0].state.time_s == before_s and waiting is not None:
             # this picture was no use: the one left out last is nearer to it than any other
-            state = advance(state, waiting, rng, pool)
+            rivals = _followed(rivals, waiting, rng, pool)
         waiting = None
-    if state is None:
+    if not rivals:
         raise InputError("no usable picture to begin tracking with")
-    return _result(advance(state, waiting, rng, pool) if waiting is not None else state)
+    if waiting is not None:
+        rivals = _followed(rivals, waiting, rng, pool)
+    return _verified([rival.state for rival in rivals], pool) if rivals[0].state.repeats else _result(rivals[0].state)
+
+
+@dataclass(frozen=True, slots=True)
+class _Rival:
+    """One of several alignments that are followed side by side, with what it has cost since they parted."""
+
+    state: TrackState
+    cost: Array = field(default_factory=lambda: np.zeros(1))
+    """Sum over pictures of the dissimilarity of each point, (n,)."""
+
+
+def _followed(
+    rivals: list[_Rival], picture: TimedPicture, rng: np.random.Generator, pool: Executor | None
+) -> list[_Rival]:
+    """Follow each rival into a picture, and drop those that are worse than the best by now, or have become the same."""
+    after = [(rival, state) for rival in rivals for state in _advanced(rival.state, picture, rng, pool)]
+    if len(after) == 1:
+        return [_Rival(after[0][1])]
+    best_time_s = max(state.time_s for _, state in after)
+    if best_time_s == rivals[0].state.time_s:  # no use to any of them
+        return [_Rival(state, rival.cost) for rival, state in after]
+    judge = _Judge(packed_codes(picture.image), tone_of(picture.image), pool)
+    judged = [_Rival(state, rival.cost + _cost_of(state, judge, best_time_s)) for rival, state in after]
+    judged.sort(key=lambda rival: _mean_of(rival.cost))
+    kept: list[_Rival] = []
+    for rival in judged:
+        same = any(_median_distance(rival.state.points_px, one.state.points_px) < _SAME_PX for one in kept)
+        worse = bool(kept) and _z_of_worse(kept[0].cost, rival.cost) >= rival.state.options.decisive_z
+        if not same and not worse and len(kept) < rival.state.options.most_rivals:
+            kept.append(rival)
+    return kept
+
+
+def _cost_of(state: TrackState, judge: _Judge, time_s: float) -> Array:
+    """What the picture of a time costs a state, (n,); the most where the state could not use it."""
+    if state.time_s != time_s:
+        return np.full(len(state.points_px), 4.0 + _TONE_WEIGHT)
+    return judge.cost(state, state.points_px, np.eye(2, 3))
+
+
+_REPEATING_STEP_S = 0.05
+"""Where the ground repeats itself the camera must not change its speed by half a period within a step."""
 
 
 def _may_wait(state: TrackState, picture: TimedPicture) -> bool:
     """True if a picture is worth matching only should it turn out to be the last one."""
-    soon = picture.time_s - state.time_s < state.options.most_step_s
-    return soon and predicted_step_px(state, picture.time_s) < state.options.step_px and is_usable(state, picture)
+    options, elapsed_s = state.options, picture.time_s - state.time_s
+    if state.repeats and (
+        state.motion is None or state.motion.duration_s > options.most_step_s or elapsed_s > _REPEATING_STEP_S
+    ):
+        return False  # the mean motion over a gap is not the speed after it, and a wrong guess finds another period
+    soon = elapsed_s < options.most_step_s
+    return soon and predicted_step_px(state, picture.time_s) < options.step_px and is_usable(state, picture)
 
 
 def _result(state: TrackState) -> TrackingResult:
@@ -631,6 +905,62 @@ def _result(state: TrackState) -> TrackingResult:
         pictures_used=state.pictures_used,
         gaps=state.gaps,
     )
+
+
+def _verified(rivals: list[TrackState], pool: Executor | None) -> TrackingResult:
+    """The result on ground that repeats itself: the last picture is compared with the first once more.
+
+    Both are stills, sharper than all between. Where rivals are left, relief makes each right in a part of the picture:
+    every point goes with the one that is cheapest all around it, and is lost where none is clearly so.
+    """
+    latest_s = max(state.time_s for state in rivals)
+    rivals = [state for state in rivals if state.time_s == latest_s]
+    best = rivals[0]
+    if len(rivals) == 1:
+        return _result(best)
+    judge = _Judge(packed_codes(best.last_image), tone_of(best.last_image), pool)
+    costs = np.stack([judge.cost(_afresh(state), state.points_px, np.eye(2, 3)) for state in rivals])
+    around = np.stack([_around(cost - costs[0], best.neighbours) for cost in costs])
+    order = np.sort(around, axis=0)
+    chosen, clear = np.argmin(around, axis=0), order[1] - order[0] >= _CLEARLY_CHEAPER
+    rows = np.arange(len(chosen))
+
+    def of_chosen(values: list[Array]) -> Array:
+        return np.asarray(np.stack(values)[chosen, rows])
+
+    return replace(
+        _result(best),
+        points_px=of_chosen([state.points_px for state in rivals]),
+        warps=of_chosen([state.warps for state in rivals]),
+        dissimilarity=of_chosen([state.dissimilarity for state in rivals]),
+        ambiguity=of_chosen([state.ambiguity for state in rivals]),
+        alive=np.stack([_result(state).alive for state in rivals])[chosen, rows] & clear,
+    )
+
+
+_CLEARLY_CHEAPER = 0.1
+"""Mean cost by which one of several rivals must be cheaper about a point."""
+
+
+def _afresh(state: TrackState) -> TrackState:
+    """The state with templates of the first picture alone."""
+    if state.first is None:
+        return state
+    return replace(
+        state,
+        sources=(state.first.source,),
+        source_of=np.zeros_like(state.source_of),
+        source_px=state.start_px,
+        source_warps=np.tile(np.eye(2), (len(state.start_px), 1, 1)),
+    )
+
+
+def _around(values: Array, neighbours: NDArray[np.int64]) -> Array:
+    """Means of values (n,) over the neighbours' neighbours; nan counts as 0."""
+    known = np.nan_to_num(values, nan=0.0)
+    rows = np.where(neighbours >= 0, neighbours, np.arange(len(values))[:, None])
+    once = known[rows].mean(axis=1)
+    return np.asarray(once[rows].mean(axis=1))
 
 
 def square_field(field_lines: Grey, parity: int) -> Grey:
