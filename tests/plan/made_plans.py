@@ -143,8 +143,9 @@ class _Maker:
         rise = 3.0 if bends else 0.0
         for number, x in enumerate(along):
             end = number in (0, len(along) - 1)
-            up = rise * (1.0 - abs(x - middle) / abs(along[0] - middle)) if bends else 0.0
-            if bends and number and (along[number - 1] - middle) * (x - middle) <= 0 and trigger is not Trigger.HOVER:
+            up = float(rise * (1.0 - abs(x - middle) / abs(along[0] - middle))) if bends else 0.0
+            passed = number > 0 and course * (along[number - 1] - middle) < 0 <= course * (x - middle)
+            if bends and passed and trigger is not Trigger.HOVER:
                 self.add(WaypointRole.PATH, self.place(middle, across), height_m + rise, **more)
             if end or trigger is Trigger.HOVER:
                 hold = {"hold_s": 2.0} if trigger is Trigger.HOVER else {}
