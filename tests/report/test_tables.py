@@ -6,18 +6,17 @@ import numpy as np
 import pytest
 
 from uavkit.core.result import OrientedBlock
-from uavkit.report.drawing import round_number, shortened
+from uavkit.formats.drawing import round_number, shortened
+from uavkit.formats.html_page import Table, number
 from uavkit.report.measures import METRIC
 from uavkit.report.tables import (
     PaperComparison,
-    Table,
     check_table,
     comparison_table,
     control_table,
     gnss_shift_table,
     interior_table,
     length,
-    number,
     precision_table,
     unoriented_table,
 )

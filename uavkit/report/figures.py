@@ -10,9 +10,7 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 
 from uavkit.core.arrays import Array, Indices
 from uavkit.core.result import OrientedBlock
-from uavkit.report import figures_pictures, figures_precision
-from uavkit.report.coverage import Ground, extent_m, exteriors, footprint_m, ground_surface, overlap_counts
-from uavkit.report.drawing import (
+from uavkit.formats.drawing import (
     BLUE,
     GREY,
     HEIGHT_COLOURS,
@@ -25,6 +23,8 @@ from uavkit.report.drawing import (
     plain_axes,
     shortened,
 )
+from uavkit.report import figures_pictures, figures_precision
+from uavkit.report.coverage import Ground, extent_m, exteriors, footprint_m, ground_surface, overlap_counts
 from uavkit.report.measures import determined_points, length_unit, rays_of_points, view_tilts_deg
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from matplotlib.patches import ConnectionPatch
 
 from uavkit.core.arrays import Array, Image
 from uavkit.core.result import OrientedBlock
-from uavkit.report.drawing import GREY, INK, ORANGE, WIDTH_IN, Drawing, new_figure, shortened
+from uavkit.formats.drawing import GREY, INK, ORANGE, WIDTH_IN, Drawing, new_figure, shortened
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

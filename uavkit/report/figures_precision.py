@@ -8,7 +8,7 @@ import numpy as np
 from uavkit.core.arrays import Array, Flags, Indices
 from uavkit.core.camera import INTERIOR_PARAMETERS
 from uavkit.core.result import OrientedBlock, PointDifference
-from uavkit.report.drawing import (
+from uavkit.formats.drawing import (
     AXIS_COLOURS,
     AXIS_NAMES,
     BLUE,

@@ -1,8 +1,6 @@
 """The report: one HTML file that needs nothing beside it, and its figures as PNG files."""
 
-import base64
-import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
@@ -12,64 +10,20 @@ from uavkit.core.errors import AdjustmentError
 from uavkit.core.progress import Progress, silent
 from uavkit.core.result import OrientedBlock
 from uavkit.formats.atomic import atomic_path, write_text
+from uavkit.formats.html_page import document, figure_html, number, section, table_html
 from uavkit.report import tables
 from uavkit.report.coverage import ground_surface
 from uavkit.report.measures import accuracy, length_unit
 from uavkit.report.relative import relative_precision
-from uavkit.report.tables import PaperComparison, Table, number
+from uavkit.report.tables import PaperComparison
 from uavkit.report.verdict import Remark, Weight, remarks, sigma0_sentence
 
 PAGE_NAME = "report.html"
-SHORT_TABLE = 16
-"""Tables up to so many rows are not parted between two printed pages."""
 DATUM_TEXTS = {
     Datum.CONTROL: "ground control points",
     Datum.GNSS: "GNSS positions",
     Datum.FREE_NETWORK: "free network",
 }
-STYLE_SHEET = """
-:root { --ink: #1d2327; --soft: #5c666d; --line: #d5dadd; --pale: #f4f6f7; --accent: #0b5a8a; }
-* { box-sizing: border-box; }
-body { margin: 0 auto; padding: 2.2rem 1.4rem 4rem; max-width: 1000px; color: var(--ink); background: #fff;
-  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", "DejaVu Sans", Arial, sans-serif; }
-h1 { font-size: 1.75rem; line-height: 1.25; margin: 0 0 .2rem; overflow-wrap: anywhere; }
-h2 { font-size: 1.25rem; margin: 2.6rem 0 .8rem; padding-bottom: .25rem; border-bottom: 2px solid var(--accent); }
-h3 { font-size: 1rem; margin: 1.6rem 0 .4rem; overflow-wrap: anywhere; }
-p { margin: .4rem 0; }
-.soft, .note, figcaption { color: var(--soft); font-size: .88rem; }
-.keys { display: grid; grid-template-columns: repeat(auto-fit, minmax(260px, 1fr)); gap: .7rem; margin: 1.3rem 0; }
-.key { border: 1px solid var(--line); border-radius: 4px; padding: .6rem .8rem; }
-.key b { display: block; font-size: 1.35rem; line-height: 1.3; font-weight: 600; }
-.key span { color: var(--soft); font-size: .85rem; display: block; }
-.verdict { border: 1px solid var(--line); border-left: 5px solid var(--accent); background: var(--pale);
-  padding: .9rem 1.1rem; margin: 1.2rem 0; border-radius: 4px; }
-.verdict h2 { border: 0; margin: 0 0 .5rem; padding: 0; font-size: 1.12rem; }
-.verdict ul { list-style: none; margin: 0; padding: 0; }
-.verdict li { display: grid; grid-template-columns: 8.6rem 1fr; gap: .8rem; padding: .25rem 0;
-  overflow-wrap: anywhere; }
-.weight { font-weight: 600; font-size: .86rem; padding-top: .1rem; }
-.limits { color: #a33b00; } .watch { color: #7a5600; } .good { color: #00694b; } .remark { color: var(--soft); }
-figure { margin: 1.4rem 0 2rem; break-inside: avoid; }
-figure img { max-width: 100%; height: auto; display: block; margin: 0 auto; }
-figcaption { margin-top: .35rem; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; font-size: .86rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .28rem .5rem; border-bottom: 1px solid var(--line); text-align: right; vertical-align: top;
-  white-space: nowrap; }
-thead th { border-bottom: 1.5px solid var(--ink); font-weight: 600; vertical-align: bottom; }
-th:first-child, td.text { text-align: left; }
-td.text, th { white-space: normal; }
-td.text, tbody th { overflow-wrap: anywhere; min-width: 6rem; }
-tbody th { font-weight: 400; }
-.wide table { font-size: .74rem; } .wide th, .wide td { padding: .2rem .3rem; } .wide tbody th { min-width: 4.5rem; }
-details { margin: 1rem 0; } summary { cursor: pointer; font-weight: 600; padding: .2rem 0; }
-@page { margin: 16mm 14mm; }
-@media print { body { padding: 0; font-size: 10pt; max-width: none; } h2, h3 { break-after: avoid; }
-  tr, .verdict li, .key, .short { break-inside: avoid; }
-  .scroll { overflow: visible; } thead { display: table-header-group; }
-  details::details-content { content-visibility: visible; block-size: auto; } .wide table { font-size: 6.4pt; }
-  .weight, .key, h2, .verdict { print-color-adjust: exact; -webkit-print-color-adjust: exact; } }
-"""
 
 
 def write_report(
@@ -104,14 +58,14 @@ def write_report(
         _process_section(result),
     ]
     path = folder / PAGE_NAME
-    write_text(path, _document(title, body))
+    write_text(path, document(f"{title}: report", body))
     return path
 
 
 def _figures(result: OrientedBlock, folder: Path, progress: Progress) -> dict[str, str]:
     """Draw the figures, write them, and return each one's HTML by its name."""
+    from uavkit.formats.drawing import png_bytes
     from uavkit.report import figures  # matplotlib comes with it
-    from uavkit.report.drawing import png_bytes
 
     total = figures.COUNT
     shown: dict[str, str] = {}
@@ -125,29 +79,9 @@ def _figures(result: OrientedBlock, folder: Path, progress: Progress) -> dict[st
         png = png_bytes(drawing.figure)
         with atomic_path(path) as temporary:
             temporary.write_bytes(png)
-        shown[drawing.name] = _figure_html(drawing.title, drawing.caption, png)
+        shown[drawing.name] = figure_html(drawing.title, drawing.caption, png)
     progress("figures", total, total)
     return shown
-
-
-def _figure_html(title: str, caption: str, png: bytes) -> str:
-    width = int.from_bytes(png[16:20], "big")
-    data = base64.b64encode(png).decode("ascii")
-    return (
-        f"<figure><h3>{escape(title)}</h3>"
-        f'<img alt="{escape(title)}" style="width:{round(width * 0.81)}px" src="data:image/png;base64,{data}">'
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
-    )
-
-
-def _document(title: str, body: Iterable[str]) -> str:
-    content = "\n".join(part for part in body if part)
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}: report</title>\n<style>{STYLE_SHEET}</style>\n</head>\n<body>\n{content}\n</body>\n"
-        "</html>\n"
-    )
 
 
 def _headline(result: OrientedBlock, title: str, date: str) -> str:
@@ -253,20 +187,16 @@ def _verdict(found: Sequence[Remark]) -> str:
     return f'<section class="verdict"><h2>What limits this result, and what to watch</h2><ul>{items}</ul></section>'
 
 
-def _section(title: str, *parts: str) -> str:
-    return f"<section><h2>{escape(title)}</h2>\n" + "\n".join(part for part in parts if part) + "\n</section>"
-
-
 def _comparison(result: OrientedBlock, comparison: PaperComparison | None) -> str:
     if comparison is None:
         return ""
-    return _section("Comparison", table_html(tables.comparison_table(result, comparison)))
+    return section("Comparison", table_html(tables.comparison_table(result, comparison)))
 
 
 def _accuracy_section(result: OrientedBlock, pictures: dict[str, str]) -> str:
     check = "" if result.check else "<p>No check points: accuracy is predicted, not checked.</p>"
     control = "" if result.control else "<p>No ground control points.</p>"
-    return _section(
+    return section(
         "Accuracy and precision",
         table_html(tables.accuracy_table(result)) if result.check or result.control else "",
         check or table_html(tables.check_table(result)),
@@ -280,7 +210,7 @@ def _accuracy_section(result: OrientedBlock, pictures: dict[str, str]) -> str:
 def _block_section(result: OrientedBlock, pictures: dict[str, str]) -> str:
     unoriented = table_html(tables.unoriented_table(result)) if result.unoriented else ""
     strips = tables.strips_table(result)
-    return _section(
+    return section(
         "The block",
         pictures["plan"],
         pictures["oblique"],
@@ -292,7 +222,7 @@ def _block_section(result: OrientedBlock, pictures: dict[str, str]) -> str:
 
 
 def _image_section(result: OrientedBlock, pictures: dict[str, str]) -> str:
-    return _section(
+    return section(
         "Image observations",
         table_html(tables.groups_table(result)),
         pictures["image_residuals"],
@@ -303,9 +233,9 @@ def _image_section(result: OrientedBlock, pictures: dict[str, str]) -> str:
 
 def _gnss_section(result: OrientedBlock, pictures: dict[str, str]) -> str:
     if not len(result.adjustment.gnss_used):
-        return _section("GNSS", "<p>No GNSS position takes part in the adjustment.</p>")
+        return section("GNSS", "<p>No GNSS position takes part in the adjustment.</p>")
     rejected = tables.gnss_rejected_table(result)
-    return _section(
+    return section(
         "GNSS",
         table_html(tables.gnss_shift_table(result)),
         pictures["gnss_residuals"],
@@ -314,7 +244,7 @@ def _gnss_section(result: OrientedBlock, pictures: dict[str, str]) -> str:
 
 
 def _interior_section(result: OrientedBlock, pictures: dict[str, str]) -> str:
-    return _section(
+    return section(
         "Interior orientation",
         table_html(tables.interior_table(result)),
         pictures["interior_correlation"],
@@ -328,43 +258,10 @@ def _points_section(result: OrientedBlock, pictures: dict[str, str]) -> str:
         parts.append(table_html(tables.candidates_table(result)))
     if result.pictures is not None:
         parts += [pictures["orientation_codes"], pictures["richness"], pictures["matches"]]
-    return _section("How the points were found", *parts)
+    return section("How the points were found", *parts)
 
 
 def _process_section(result: OrientedBlock) -> str:
     if not result.seconds:
         return ""
-    return _section("Computing", table_html(tables.seconds_table(result)))
-
-
-def table_html(table: Table) -> str:
-    """Return a table as HTML; texts are escaped, columns of words are set to the left."""
-    words = [_is_text(row[column] for row in table.rows) for column in range(len(table.header))]
-    head = "".join(_head_cell(text, word) for text, word in zip(table.header, words, strict=True))
-    body = "\n".join(
-        f'<tr><th scope="row">{escape(row[0])}</th>'
-        + "".join(_cell(text, word) for text, word in zip(row[1:], words[1:], strict=True))
-        + "</tr>"
-        for row in table.rows
-    )
-    wide = " wide" if len(table.header) > 12 else ""
-    wide += " short" if len(table.rows) <= SHORT_TABLE else ""
-    note = f'<p class="note">{escape(table.note)}</p>' if table.note else ""
-    inner = (
-        f'<div class="scroll{wide}"><table><thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table></div>{note}'
-    )
-    if table.folded:
-        return f"<details><summary>{escape(table.title)} ({len(table.rows)} rows)</summary>{inner}</details>"
-    return f"<h3>{escape(table.title)}</h3>{inner}"
-
-
-def _is_text(cells: Iterable[str]) -> bool:
-    return any(re.search(r"[^\W\d_]{3}", cell) for cell in cells)
-
-
-def _head_cell(text: str, is_text: bool) -> str:
-    return f'<th scope="col" style="text-align:left">{escape(text)}</th>' if is_text else f"<th>{escape(text)}</th>"
-
-
-def _cell(text: str, is_text: bool) -> str:
-    return f'<td class="text">{escape(text)}</td>' if is_text else f"<td>{escape(text)}</td>"
+    return section("Computing", table_html(tables.seconds_table(result)))

@@ -12,6 +12,7 @@ from uavkit.core.arrays import Array
 from uavkit.core.camera import INTERIOR_PARAMETERS
 from uavkit.core.points import PointKind
 from uavkit.core.result import OrientedBlock, PointDifference, PointOrigin
+from uavkit.formats.html_page import NOTHING, Table, number
 from uavkit.report.measures import (
     Accuracy,
     LengthUnit,
@@ -30,27 +31,10 @@ from uavkit.report.measures import (
 )
 from uavkit.report.relative import relative_precision
 
-NOTHING = "–"
 PUBLISHED_STILLS = 33
 WITHIN_THE_BLOCK = "after the block is fitted to the GNSS positions by shift, rotation and scale"
 COLLAPSE_ABOVE = 40
 """Tables with more rows than this are folded."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Table:
-    """Rows of texts under a heading; the first column names the row."""
-
-    title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    note: str = ""
-    folded: bool = False
-    """Shown closed, with its title only, until it is opened."""
-
-    def __post_init__(self) -> None:
-        if any(len(row) != len(self.header) for row in self.rows):
-            raise ValueError(f"table {self.title!r}: a row has not {len(self.header)} cells")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,14 +71,6 @@ class PaperComparison:
     def values(self) -> tuple[int, float, float]:
         """Return the points found, RMSE XY and RMSE Z in metres as published (section 3)."""
         return (1029, 0.016, 0.022) if self.flight == "constant" else (1489, 0.020, 0.024)
-
-
-def number(value: float, decimals: int = 1) -> str:
-    """Return a number as text, a dash where there is none."""
-    if not np.isfinite(value):
-        return NOTHING
-    text = f"{value:.{decimals}f}"
-    return text[1:] if text.startswith("-") and float(text) == 0.0 else text
 
 
 def thousandths(value_m: float) -> str:

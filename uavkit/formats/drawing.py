@@ -1,4 +1,4 @@
-"""What all figures have in common: style, colours, and the bytes of a picture."""
+"""What all figures have in common: style, colours, and the bytes of a picture. Imports matplotlib."""
 
 import io
 import warnings
