@@ -10,11 +10,11 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from tests.plan.made_plans import GROUND_M, made_plan
+from tests.plan.made_plans import GROUND_M, level, made_plan
 from uavkit.core.arrays import Array
 from uavkit.core.errors import InputError
 from uavkit.core.flightplan import FlightPlan, Trigger, WaypointRole
-from uavkit.core.frames import geoid_undulation_m
+from uavkit.core.frames import LocalMap, geoid_undulation_m
 from uavkit.core.mission import Mission, MissionCommand, MissionFrame, MissionItem
 from uavkit.core.vehicle import VehicleKind
 from uavkit.formats.waypoints_file import read_waypoints
@@ -60,6 +60,32 @@ def do(command: int, *parameters: float) -> MissionItem:
 def path_m(taken: ExpectedExposures) -> Array:
     """Return north and east of exposures of a mission made with ``place``."""
     return np.column_stack([(taken.latitude_deg - 1.0) * 110_575.6, (taken.longitude_deg - 1.0) * 111_302.6])
+
+
+def circle_plan(trigger: Trigger, exposures: int, radius_m: float) -> FlightPlan:
+    """Return a plan of one round about a point, looking at it, with a waypoint at each exposure."""
+    plan = made_plan(trigger, strips=1, exposures=exposures)
+    local_map = LocalMap(latitude_deg=35.8, longitude_deg=139.65, height_ellipsoid_m=GROUND_M)
+    angles = np.radians(np.append(np.arange(exposures), exposures - 0.6) * 360.0 / exposures)
+    places = local_map.geographic_from_map(radius_m * np.column_stack([np.sin(angles), np.cos(angles)]))
+    headings = (np.degrees(angles) + 180.0) % 360.0
+    first = next(w for w in plan.sorties[0].waypoints if w.role is WaypointRole.EXPOSURE)
+    roles = [WaypointRole.EXPOSURE, *[WaypointRole.PATH] * (exposures - 2), WaypointRole.EXPOSURE, WaypointRole.EXIT]
+    ring = [
+        replace(
+            first, role=role, latitude_deg=float(latitude), longitude_deg=float(longitude), heading_deg=float(heading),
+            exposure=number if role is WaypointRole.EXPOSURE else -1,
+        )
+        for number, (role, (latitude, longitude), heading) in enumerate(zip(roles, places, headings, strict=True))
+    ]  # fmt: skip
+    start, transit, *_, home = plan.sorties[0].waypoints
+    strip = replace(plan.strips[0], base_m=2.0 * math.pi * radius_m / exposures)
+    table = replace(
+        plan.exposures, latitude_deg=places[:-1, 0], longitude_deg=places[:-1, 1], heading_deg=headings[:-1],
+        R_map_from_image=np.stack([level(heading) for heading in headings[:-1]]),
+    )  # fmt: skip
+    flight = replace(plan.sorties[0], waypoints=(start, transit, *ring, home))
+    return replace(plan, exposures=table, sorties=(flight,), strips=(strip,))
 
 
 WAYPOINT, DISTANCE = MissionCommand.WAYPOINT, MissionCommand.DO_SET_CAM_TRIGG_DIST
@@ -137,6 +163,40 @@ def test_time_interval_is_base_by_speed() -> None:
     starts = commands(mission, MissionCommand.IMAGE_START_CAPTURE)
     assert [item.parameters[:3] for item in starts] == [(0.0, 2.4, 0.0)] * 3
     assert len(commands(mission, MissionCommand.IMAGE_STOP_CAPTURE)) == 3
+
+
+def test_strips_that_climb_are_triggered_by_their_speed_over_ground() -> None:
+    plan = made_plan(Trigger.TIME, bends=True)
+    taken = exposures_of(mission_of(plan, 0, "px4", "take_off"))
+    assert len(taken) == len(plan.exposures)
+    assert distances_m(plan, taken).max() < 0.01
+
+
+@pytest.mark.parametrize("trigger", [Trigger.DISTANCE, Trigger.TIME])
+def test_on_a_circle_the_chord_counts(trigger: Trigger) -> None:
+    """Twelve exposures at 30 degrees of a circle of 20 m: the base is 10.47 m of arc, the vehicle measures 10.35 m."""
+    plan = circle_plan(trigger, exposures=12, radius_m=20.0)
+    mission = mission_of(plan, 0, "ardupilot", "take_off")
+    taken = exposures_of(mission)
+    assert len(taken) == 12
+    assert distances_m(plan, taken).max() < 0.05
+    assert angle_deg(taken.heading_deg, plan.exposures.heading_deg).max() < 30.1
+    if trigger is Trigger.DISTANCE:
+        assert commands(mission, DISTANCE)[0].parameters[0] == pytest.approx(
+            40.0 * math.sin(math.radians(15.0)), rel=1e-3
+        )
+
+
+def test_distance_triggers_cannot_go_straight_up() -> None:
+    plan = made_plan(strips=1)
+    table = replace(
+        plan.exposures,
+        latitude_deg=np.full(5, 35.8),
+        longitude_deg=np.full(5, 139.65),
+        height_ellipsoid_m=50.0 + 12.0 * np.arange(5),
+    )
+    with pytest.raises(InputError, match="strip 1 goes up and down"):
+        mission_of(replace(plan, exposures=table), 0, "px4", "take_off")
 
 
 @pytest.mark.parametrize(

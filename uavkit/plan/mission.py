@@ -32,6 +32,10 @@ _PITCH_STEP_DEG = 0.5
 _SHORTEST_COURSE_M = 1.0
 """Legs that go less far across the ground have no course."""
 _DEGREE_M = 111_000.0
+_A_M, _E2 = 6378137.0, 0.00669437999014
+"""Half axis and squared eccentricity of WGS 84."""
+_SHORT_OF_A_CORNER = 1e-4
+"""Where exposures are at the corners of a path: a vehicle that comes to a corner is not kept from triggering there."""
 
 
 def mission_of(
@@ -215,11 +219,11 @@ def _camera_commands(
         taken = [number for number in run if waypoints[number].exposure >= 0]
         if not taken:
             continue
-        strip, last = plan.strips[waypoints[run[0]].strip], run[-1]
-        if not strip.base_m > 0:
+        strip, last = waypoints[run[0]].strip, run[-1]
+        if not plan.strips[strip].base_m > 0:
             commands[taken[0]] = (_take_one(autopilot),)
             continue
-        start, stop = _start_and_stop(plan.trigger, strip.base_m, waypoints[taken[-1]].speed_m_s)
+        start, stop = _start_and_stop(plan, strip, waypoints[taken[-1]].speed_m_s)
         leaving = next((number for number in run if waypoints[number].role is WaypointRole.EXIT), last)
         commands[taken[0]] = (start,) if leaving != taken[0] else (start, stop)
         commands.setdefault(leaving, (stop,))
@@ -232,12 +236,39 @@ def _take_one(autopilot: str) -> MissionItem:
     return _command(MissionCommand.DO_DIGICAM_CONTROL, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
-def _start_and_stop(trigger: Trigger, base_m: float, speed_m_s: float) -> tuple[MissionItem, MissionItem]:
-    if trigger is Trigger.TIME:
+def _start_and_stop(plan: FlightPlan, strip: int, speed_m_s: float) -> tuple[MissionItem, MissionItem]:
+    across_m, up_m = _steps_m(plan, strip)
+    if plan.trigger is Trigger.TIME:
         if not speed_m_s > 0:
             raise InputError("triggering by time needs the speed on the strips: give speed_m_s in [flight]")
-        interval_s = base_m / speed_m_s
+        interval_s = max(across_m, up_m) / speed_m_s
         start = _command(MissionCommand.IMAGE_START_CAPTURE, 0.0, interval_s, 0.0)
         return start, _command(MissionCommand.IMAGE_STOP_CAPTURE)
-    start = _command(MissionCommand.DO_SET_CAM_TRIGG_DIST, base_m, 0.0, 1.0)
+    if across_m < 0.5 * plan.strips[strip].base_m:
+        raise InputError(
+            f"{plan.name}: strip {strip + 1} goes up and down, and autopilots measure the distance between exposures "
+            f"across the ground: trigger by hover or time"
+        )
+    start = _command(MissionCommand.DO_SET_CAM_TRIGG_DIST, across_m, 0.0, 1.0)
     return start, _command(MissionCommand.DO_SET_CAM_TRIGG_DIST)
+
+
+def _steps_m(plan: FlightPlan, strip: int) -> tuple[float, float]:
+    """Return how far it is from an exposure of a strip to the next, straight across the ground and up or down.
+
+    On a straight strip the first is its base; on a circle the vehicle measures the chord, which is shorter.
+    """
+    table, base_m = plan.exposures, plan.strips[strip].base_m
+    rows = np.flatnonzero(table.strip == strip)
+    rows = rows[:-1][(np.diff(rows) == 1) & (np.diff(table.sortie[rows]) == 0)] if len(rows) > 1 else rows[:0]
+    if len(rows) == 0:
+        return base_m, 0.0
+    latitude = np.radians(table.latitude_deg[rows])
+    w = np.sqrt(1.0 - _E2 * np.sin(latitude) ** 2)
+    north_m = _A_M * (1.0 - _E2) / w**3 * np.radians(table.latitude_deg[rows + 1] - table.latitude_deg[rows])
+    turned_deg = (table.longitude_deg[rows + 1] - table.longitude_deg[rows] + 180.0) % 360.0 - 180.0
+    east_m = _A_M / w * np.cos(latitude) * np.radians(turned_deg)
+    across_m = float(np.median(np.hypot(north_m, east_m)))
+    up_m = float(np.median(np.abs(table.height_ellipsoid_m[rows + 1] - table.height_ellipsoid_m[rows])))
+    straight = abs(across_m - base_m) < 1e-3 * base_m
+    return (base_m if straight else across_m * (1.0 - _SHORT_OF_A_CORNER)), up_m

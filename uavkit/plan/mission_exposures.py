@@ -224,7 +224,7 @@ class _Follower:
             self.heading_deg = self._true_direction_deg(dx, dy)
         self.commanded_deg = math.nan  # holds for one leg: ArduPilot's next waypoint takes the heading back
         if self.interval_s > 0:  # with both on, ArduPilot triggers by time alone
-            length_m = math.hypot(dx, dy, goal.altitude_m - self.here.altitude_m)
+            length_m = max(math.hypot(dx, dy), abs(goal.altitude_m - self.here.altitude_m))  # speed is over ground
             self._take_by_time(goal, self._duration_s(length_m))
         elif self.distance_m > 0:
             self._take_by_distance(goal)
