@@ -7,7 +7,7 @@ error of the transformation between still and video cancels.
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import islice, pairwise
 
@@ -24,6 +24,7 @@ from uavkit.core.progress import Progress, silent
 from uavkit.core.result import PointOrigin
 from uavkit.core.video import AffineTransformation, fields_of_frame
 from uavkit.process.candidates import Candidates
+from uavkit.process.contrast import FAINT, contrast, stretched
 from uavkit.process.measurement import RayTasks, measure_rays
 from uavkit.process.options import CandidateOptions, MeasurementOptions
 from uavkit.process.orientation_code import orientation_codes, richness, select_points
@@ -235,7 +236,7 @@ def _gap_key(
     sync = given.sync
     return content_hash(
         [
-            "video 3",
+            "video 4",
             given.video.fingerprint(),
             given.store.fingerprint(image),
             given.store.fingerprint(target),
@@ -370,14 +371,23 @@ def track_between_stills(
 def pictures_between(
     given: VideoInput, places: tuple[StillInVideo, StillInVideo], helpers: Helpers
 ) -> Iterator[TimedPicture]:
-    """Yield the first still, all fields between the two shutters, and the second still, all in video geometry."""
+    """Yield the first still, all fields between the two shutters, and the second still, all in video geometry.
+
+    All are stretched where the first still shows faint ground.
+    """
     here, there = places
     names = given.store.names
-    image = helpers.as_video(names.index(here.still))
-    yield TimedPicture(image=image, time_s=here.exposure_time_ns * 1e-9)
-    yield from read_ahead(_fields_between(given, places), helpers.pool)
-    image = helpers.as_video(names.index(there.still))
-    yield TimedPicture(image=image, time_s=there.exposure_time_ns * 1e-9)
+    first, last = (helpers.as_video(names.index(place.still)) for place in (here, there))
+    fields = _fields_between(given, places)
+    if contrast(first) < FAINT:
+        first, last, fields = stretched(first), stretched(last), map(_stretched_field, fields)
+    yield TimedPicture(image=first, time_s=here.exposure_time_ns * 1e-9)
+    yield from read_ahead(fields, helpers.pool)
+    yield TimedPicture(image=last, time_s=there.exposure_time_ns * 1e-9)
+
+
+def _stretched_field(picture: TimedPicture) -> TimedPicture:
+    return replace(picture, image=stretched(picture.image))
 
 
 def _fields_between(given: VideoInput, places: tuple[StillInVideo, StillInVideo]) -> Iterator[TimedPicture]:
