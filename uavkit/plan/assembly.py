@@ -80,9 +80,16 @@ def assemble(
     """Return the parts of a plan over lines in the order of flight, from a station on."""
     on_map = [(member, line.moved(sets[member].axes, sets[member].origin_m)) for member, line in flown]
     starts = stations_of([line for _, line in on_map])
-    spans = _spans(request, on_map, field, flies, vehicle, first_station)
-    parts = _parts(sets, flown, measures, starts, spans)
-    sorties, times = _sorties(parts, field, flies, fences)
+    most_s = vehicle.endurance_s * (1.0 - request.sorties.reserve) if vehicle is not None else float("inf")
+    aimed_s = most_s
+    while True:  # the division goes by estimates of the way there and back
+        spans = _spans(request, on_map, field, flies, (vehicle, aimed_s), first_station)
+        parts = _parts(sets, flown, measures, starts, spans)
+        sorties, times = _sorties(parts, field, flies, fences)
+        longest_s = max(sortie.record.duration_s for sortie in sorties)
+        if longest_s <= most_s:
+            break
+        aimed_s -= max(longest_s - most_s, 1.0)
     clearance = [checks.check_heights(_path(sortie), field.ground, request, 0)[0] for sortie in sorties]
     exposures = _exposures(parts, times, field)
     footprints = _footprints(sets, parts, field)
@@ -110,10 +117,11 @@ def _spans(
     on_map: Sequence[tuple[int, StationLine]],
     field: Airfield,
     flies: Performance,
-    vehicle: VehicleProfile | None,
+    limit: tuple[VehicleProfile | None, float],
     first_station: int,
 ) -> list[tuple[int, int]]:
-    """Return first and last station of each sortie."""
+    """Return first and last station of each sortie of a vehicle that may take no longer than a time (s)."""
+    vehicle, most_s = limit
     times = [line_times(line, flies) for _, line in on_map]
     stations = np.concatenate([line.centres_m for _, line in on_map])
     if not 0 <= first_station < len(stations):
@@ -124,7 +132,7 @@ def _spans(
     most = asked.most_items or (vehicle.most_mission_items if vehicle is not None else MOST_ITEMS)
     items = _running_items(on_map, flies)
     limits = SortieLimits(
-        duration_s=vehicle.endurance_s * (1.0 - asked.reserve) if vehicle is not None else float("inf"),
+        duration_s=most_s,
         items=float(most - ITEMS_OF_A_SORTIE) if asked.split_at_items else float("inf"),
         overlap_stations=asked.overlap_images,
     )

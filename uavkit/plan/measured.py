@@ -43,14 +43,68 @@ def measure_lines(laid: LaidSet, lines: Sequence[StationLine], workers: int) -> 
     rows: dict[int, list[StationLine]] = {}
     for line in lines:
         rows.setdefault(line.row, []).append(line)
-    area = _PreparedArea(laid.area)
 
-    def measure(line: StationLine) -> LineMeasures:
+    def look(line: StationLine) -> _Looked:
         beside = [_near(rows.get(line.row + step, []), line) for step in (-1, 1)]
-        return _measure(laid, line, [found for found in beside if found], area)
+        return _look(laid, line, [found for found in beside if found])
 
     with ThreadPoolExecutor(max_workers=workers) as pool:
-        return list(pool.map(measure, lines))
+        looked = list(pool.map(look, lines))
+    area = _PreparedArea(laid.area)  # shapely's prepared shapes are not for threads
+    return [_measures(found, area) for found in looked]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Looked:
+    """What the images of a line see, without regard to the area."""
+
+    forward: Array
+    sides: Array
+    """(sides with a line beside, n)."""
+    gsd_m: Array
+    middles_m: Array
+    """(n, 2)."""
+    rims_m: Array
+    """(n, m, 3)."""
+
+
+def _look(laid: LaidSet, line: StationLine, beside: list[list[StationLine]]) -> _Looked:
+    imaging, ground = laid.mounting.imaging, laid.mounting.ground
+    points = (
+        points_on_ground(imaging, ground, line) if laid.target_m is None else _points_about(laid.target_m, laid, line)
+    )
+    beside = beside if laid.target_m is None else []
+    return _Looked(
+        forward=forward_overlaps(imaging, line, points),
+        sides=_sides(imaging, line, points, beside),
+        gsd_m=_ground_distances(imaging, line, points),
+        middles_m=points_on_ground(imaging, ground, line, np.array([[0.0, 0.0, -1.0]]))[:, 0, :2],
+        rims_m=points_on_ground(imaging, ground, line, imaging.rim_directions),
+    )
+
+
+def _points_about(target_m: Array, laid: LaidSet, line: StationLine) -> Array:
+    """Return where the nodes (n, m, 3) of images lie on the plane across each view through a target (3,)."""
+    views = -line.rotations[:, :, 2]
+    depths = np.einsum("nk,nk->n", target_m - line.centres_m, views)
+    rays = np.einsum("nij,mj->nmi", line.rotations, laid.mounting.imaging.directions)
+    return np.ascontiguousarray(line.centres_m[:, None, :] + depths[:, None, None] * rays)
+
+
+def _measures(looked: _Looked, area: "_PreparedArea") -> LineMeasures:
+    middle_in_area = area.contains(looked.middles_m)
+    sees_area = area.meets(looked.rims_m) | middle_in_area
+    side = np.full(len(looked.forward), np.nan)
+    if len(looked.sides):
+        rim_only = np.where(sees_area, looked.sides.max(axis=0), np.nan)
+        side = np.where(middle_in_area, looked.sides.min(axis=0), rim_only)
+    return LineMeasures(
+        forward=looked.forward,
+        side=side,
+        gsd_m=looked.gsd_m,
+        sees_area=sees_area,
+        middle_in_area=middle_in_area,
+    )
 
 
 def are_beside(line: StationLine, other: StationLine) -> bool:
@@ -98,35 +152,13 @@ class _PreparedArea:
         return np.asarray(shapely.intersects(self.area, hulls))
 
 
-def _measure(laid: LaidSet, line: StationLine, beside: list[list[StationLine]], area: _PreparedArea) -> LineMeasures:
-    imaging = laid.mounting.imaging
-    points = points_on_ground(imaging, laid.mounting.ground, line)
-    forward = forward_overlaps(imaging, line, points)
-    middle = points_on_ground(imaging, laid.mounting.ground, line, np.array([[0.0, 0.0, -1.0]]))[:, 0, :2]
-    middle_in_area = area.contains(middle)
-    rims = points_on_ground(imaging, laid.mounting.ground, line, imaging.rim_directions)
-    sees_area = area.meets(rims) | middle_in_area
-    return LineMeasures(
-        forward=forward,
-        side=_side(imaging, line, points, beside, (sees_area, middle_in_area)),
-        gsd_m=_ground_distances(imaging, line, points),
-        sees_area=sees_area,
-        middle_in_area=middle_in_area,
-    )
-
-
-def _side(
-    imaging: Imaging, line: StationLine, points: Array, beside: list[list[StationLine]], sees: tuple[Flags, Flags]
-) -> Array:
-    result = np.full(len(line), np.nan)
-    if not beside:
-        return result
+def _sides(imaging: Imaging, line: StationLine, points: Array, beside: list[list[StationLine]]) -> Array:
+    """Return the shares (sides, n) that the lines of each side show."""
     step = line.centres_m[-1, :2] - line.centres_m[0, :2]
     length = float(np.hypot(*step))
     direction = step / length if length > 0.0 else np.array([0.0, 1.0])
-    shares = np.array([side_overlaps(imaging, points, Neighbours.of(direction, lines)) for lines in beside])
-    sees_area, middle_in_area = sees
-    return np.where(middle_in_area, shares.min(axis=0), np.where(sees_area, shares.max(axis=0), np.nan))
+    shares = [side_overlaps(imaging, points, Neighbours.of(direction, lines)) for lines in beside]
+    return np.array(shares).reshape(len(shares), len(line))
 
 
 def _ground_distances(imaging: Imaging, line: StationLine, points: Array) -> Array:

@@ -36,6 +36,8 @@ class LaidSet:
     """Sets with the same number are flown together, row by row: the legs of a corridor."""
     area: Any = None
     """shapely's, in the axes of the set: where the overlap to both sides counts."""
+    target_m: Array | None = None
+    """(3,): what all images look at; they are compared on planes across their view through it, not on the ground."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,6 +226,7 @@ def orbit_set(region: Region, circles: Circles, mounting: Mounting, request: Str
         origin_m=np.zeros(3),
         half_turn=NO_TURN,
         sets_of_flight=number,
+        target_m=target,
     )
 
 

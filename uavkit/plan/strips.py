@@ -218,7 +218,7 @@ class _Layout:
         """
         ask = self.strips.request
         along = self._evenly(interval, self.base_m)
-        for _ in range(ROUNDS):
+        for turn in range(ROUNDS):
             line = self._stations(row, along, own)
             if not ask.keep_overlap or len(line) < 2:
                 return line
@@ -228,7 +228,8 @@ class _Layout:
                 return line
             factors = (1.0 - ask.forward_overlap - SPARE) / np.maximum(1.0 - shares, 1e-3)
             if self.strips.mounting.stops:
-                along = self._closer(along, factors)
+                # in the end nothing may grow again, or shares would go to and fro
+                along = self._closer(along, factors if turn < 3 else np.minimum(factors, 1.0))
             else:
                 along = self._evenly(interval, line.base_m * float(np.clip(factors.min(), 0.3, FIRMLY)))
         raise self._impossible("forward", ask.forward_overlap, row)
