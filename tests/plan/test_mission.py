@@ -13,12 +13,16 @@ from hypothesis import strategies as st
 from tests.plan.made_plans import GROUND_M, level, made_plan
 from uavkit.core.arrays import Array
 from uavkit.core.errors import InputError
-from uavkit.core.flightplan import FlightPlan, Trigger, WaypointRole
+from uavkit.core.flightplan import AreaKind, FlightPlan, SurveyArea, Trigger, WaypointRole
 from uavkit.core.frames import LocalMap, geoid_undulation_m
 from uavkit.core.mission import Mission, MissionCommand, MissionFrame, MissionItem
 from uavkit.core.vehicle import VehicleKind
+from uavkit.formats.camera_profiles import load_camera
+from uavkit.formats.plan_request import PlanRequest
+from uavkit.formats.vehicle_profiles import load_vehicle
 from uavkit.formats.waypoints_file import read_waypoints
 from uavkit.plan.mission import ExpectedExposures, exposures_of, item_count, mission_of
+from uavkit.plan.planner import plan_survey
 
 SITL = Path(__file__).resolve().parents[2] / "../shared/data/sitl"
 METRES = np.array([111_000.0, 90_000.0])
@@ -316,6 +320,15 @@ def test_headings_and_gimbal_as_commanded() -> None:
     assert taken.item.tolist() == [4, 7]
 
 
+def test_headings_count_from_true_north() -> None:
+    """Along meridians 22 km apart the map's north is 0.17 degrees off on either side."""
+    shot = do(203, 0, 0, 0, 0, 1.0)
+    corners = [(60.0, 10.0), (60.01, 10.0), (60.01, 10.4), (60.0, 10.4)]
+    legs = [replace(place(WAYPOINT, 0, 0), latitude_deg=lat, longitude_deg=lon) for lat, lon in corners]
+    items = (legs[0], legs[1], shot, legs[2], legs[3], shot)
+    assert angle_deg(exposures_of(Mission(items=items)).heading_deg, np.array([0.0, 180.0])).max() < 0.01
+
+
 def test_start_and_return_are_legs_too() -> None:
     """Triggering that nobody stops goes on from home and back to it, at the altitude of the last waypoint."""
     home = {"home_latitude_deg": 1.0, "home_longitude_deg": 1.0, "home_height_geoid_m": 5.0}
@@ -347,6 +360,35 @@ def test_jumps_and_missions_without_a_path_are_refused() -> None:
 def test_absurdly_many_exposures_are_refused() -> None:
     with pytest.raises(InputError, match="more than"):
         exposures_of(Mission(items=(place(WAYPOINT, 0, 0), do(206, 1e-3), place(WAYPOINT, 5000, 0))))
+
+
+@pytest.mark.parametrize("trigger", ["distance", "time", "hover"])
+@pytest.mark.parametrize("pattern", ["polygon", "cross_grid"])
+def test_missions_take_what_the_planner_planned(pattern: str, trigger: str) -> None:
+    """From the request to the items: the exposures of all sorties, with those that two sorties share."""
+    ring = [(35.8, 139.65), (35.8004, 139.6501), (35.8003, 139.6506), (35.8001, 139.6507)]
+    request = PlanRequest.model_validate(
+        {
+            "name": "field", "pattern": pattern, "areas": [{"latitude_longitude_deg": ring}], "camera": "Ricoh GX200",
+            "imaging": {"height_above_ground_m": 40.0, "forward_overlap": 0.6},
+            "flight": {"trigger": trigger}, "sorties": {"reserve": 0.6},
+        },
+        strict=False,
+    )  # fmt: skip
+    area = SurveyArea(name="field", kind=AreaKind.POLYGON, latitude_longitude_deg=np.array(ring))
+    vehicle = load_vehicle("Generic ArduCopter")
+    plan = plan_survey(request, (area,), load_camera("Ricoh GX200"), vehicle=vehicle).plan
+    table = plan.exposures
+    for autopilot in ("ardupilot", "px4"):
+        missions = [mission_of(plan, n, autopilot, "take_off", vehicle.kind) for n in range(len(plan.sorties))]
+        taken = [exposures_of(mission) for mission in missions]
+        assert [len(part) for part in taken] == [flight.exposures for flight in plan.sorties]
+        latitude = np.concatenate([part.latitude_deg for part in taken])
+        longitude = np.concatenate([part.longitude_deg for part in taken])
+        off = np.column_stack([latitude - table.latitude_deg, longitude - table.longitude_deg])
+        assert np.linalg.norm(off * METRES, axis=1).max() < 0.05
+        headings = np.concatenate([part.heading_deg for part in taken])
+        assert angle_deg(headings, table.heading_deg).max() < 0.5
 
 
 @pytest.mark.parametrize(

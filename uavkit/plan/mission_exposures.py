@@ -24,7 +24,7 @@ _FIXED_WINGS = frozenset({1, 16, 17, 18, 28})
 _PX4 = 12
 _SAME_STRIP_DEG = 40.0
 """Consecutive exposures belong to one strip while their direction changes by less."""
-_MOST_EXPOSURES = 1_000_000
+_MOST_EXPOSURES = 100_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -282,7 +282,7 @@ class _Follower:
         assert self.here is not None
         (latitude, longitude), *_ = self.local_map.geographic_from_map(np.array([[self.here.x_m, self.here.y_m]]))
         convergence = float(self.local_map.convergence_rad(np.array([latitude]), np.array([longitude]))[0])
-        return math.degrees(math.atan2(dx, dy) - convergence) % 360.0
+        return math.degrees(math.atan2(dx, dy) + convergence) % 360.0
 
     def exposures(self, frame: MissionFrame) -> ExpectedExposures:
         """Return what was taken."""
