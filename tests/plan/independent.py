@@ -42,6 +42,8 @@ FARTHEST_M = 3000.0
 BISECTIONS = 18
 SIGHTS = 24
 """Places between a ground point and the camera at which the line of sight must be above the ground."""
+MOST_TOLD_TOO_LOW = 0.05
+"""Of a side overlap: a plan may look for ground points in the nearest images of the neighbouring strip only."""
 GEOD = pyproj.Geod(ellps="WGS84")
 
 
@@ -414,19 +416,22 @@ def path_heights(sortie: Sortie, ground: Ground, step_m: float) -> Array:
 
 
 def strip_legs(legs: list[Leg]) -> list[list[Leg]]:
-    """Return, for each pass along a strip, its legs from ENTRY (or the first EXPOSURE) to EXIT."""
+    """Return, for each pass along a strip, its legs from ENTRY (or the first EXPOSURE) to EXIT.
+
+    A pass without EXIT ends before the first waypoint that is neither EXPOSURE nor PATH.
+    """
+    inner = (WaypointRole.EXPOSURE, WaypointRole.PATH, WaypointRole.EXIT)
     passes: list[list[Leg]] = []
     going = False
     for leg in legs:
-        begins = leg.start.role in (WaypointRole.ENTRY, WaypointRole.EXPOSURE)
-        if begins and not going:
+        if not going and leg.start.role in (WaypointRole.ENTRY, WaypointRole.EXPOSURE):
             passes.append([])
             going = True
+        going = going and leg.end.role in inner
         if going:
             passes[-1].append(leg)
-        if leg.end.role is WaypointRole.EXIT:
-            going = False
-    return passes
+            going = leg.end.role is not WaypointRole.EXIT
+    return [passed for passed in passes if passed]
 
 
 # ---------------------------------------------------------------------------------------------------------- the judge
@@ -449,7 +454,8 @@ class Judgement:
     """Least, if every neighbour of every image that sees the area is asked for."""
     forward_report_error: float = 0.0
     """Greatest difference to what the plan says."""
-    side_report_error: float = 0.0
+    side_told_too_high: float = 0.0
+    side_told_too_low: float = 0.0
     uncovered: float = np.nan
     """Share of points in the area and on its border that lie in no image."""
     hidden: float = np.nan
@@ -459,6 +465,7 @@ class Judgement:
     """Greatest along the strips, as a share of the height asked for."""
     clearance_m: float = np.nan
     """Least, minus the stated error of the elevation model."""
+    clearance_told_m: float = np.nan
     highest_m: float = np.nan
     """Greatest height above ground on the path."""
     climb_m_s: float = 0.0
@@ -537,8 +544,31 @@ def judge_lists(result: Judgement, plan: FlightPlan, request: PlanRequest) -> No
         result.faults.append("exposures far below the ellipsoid")
     for pair in unlisted_neighbours(plan):
         result.faults.append(f"strips {pair[0]} and {pair[1]} lie side by side and are no neighbours")
+    result.faults.extend(heading_faults(plan))
     if len(plan.sorties) == 0 or len(table) == 0:
         result.faults.append("nothing is flown")
+
+
+def heading_faults(plan: FlightPlan) -> list[str]:
+    """Compare headings with the azimuth to the next exposure of the strip, and images with headings, to 0.05 degrees;
+    an image's sides lie along and across the flight."""
+    table = plan.exposures
+    faults = []
+    inner = np.flatnonzero(table.strip[:-1] == table.strip[1:])
+    azimuth, _, _ = GEOD.inv(
+        table.longitude_deg[inner],
+        table.latitude_deg[inner],
+        table.longitude_deg[inner + 1],
+        table.latitude_deg[inner + 1],
+    )
+    off = np.abs((np.asarray(azimuth) - table.heading_deg[inner] + 180.0) % 360.0 - 180.0)
+    if np.any(off > 0.05):
+        faults.append(f"image {inner[np.argmax(off)]} heads {off.max():.2f} degrees off its way")
+    top_east, top_north = table.R_map_from_image[:, 0, 1], table.R_map_from_image[:, 1, 1]
+    turned = (np.degrees(np.arctan2(top_east, top_north)) - table.heading_deg + 45.0) % 90.0 - 45.0
+    if np.any(np.abs(turned) > 0.05):
+        faults.append(f"images are turned by {np.abs(turned).max():.2f} degrees against their heading")
+    return faults
 
 
 def unlisted_neighbours(plan: FlightPlan) -> list[tuple[int, int]]:
@@ -631,10 +661,10 @@ def judge_side(result: Judgement, images: Images, areas: dict[str, PlaneArea], c
         share = min(shares) if area.contains(np.array([latitude]), np.array([longitude]))[0] else max(shares)
         if not share >= result.side_overlap:
             result.side_overlap, result.side_at = share, image
-        error = abs(share - plan.exposures.side_overlap[image])
-        # of an image that sees a sliver of the area only the plan may say that it sees none of it
-        if np.isfinite(error):
-            result.side_report_error = max(result.side_report_error, error)
+        told = plan.exposures.side_overlap[image]
+        # of an image that sees a sliver of the area only the plan may say that it sees none of it: nan
+        result.side_told_too_high = float(np.fmax(result.side_told_too_high, told - share))
+        result.side_told_too_low = float(np.fmax(result.side_told_too_low, share - told))
 
 
 def judge_coverage(result: Judgement, images: Images, areas: list[PlaneArea]) -> None:
@@ -648,6 +678,7 @@ def judge_coverage(result: Judgement, images: Images, areas: list[PlaneArea]) ->
 
 def judge_path(result: Judgement, plan: FlightPlan, ground: Ground, height_m: float) -> None:
     """Measure clearance, heights along the strips, climb and descent of all sorties."""
+    result.clearance_told_m = plan.summary.least_clearance_m
     for sortie in plan.sorties:
         legs = path_legs(sortie, ground, step_m=1.0)
         above = np.concatenate([leg.above_ground_m for leg in legs])
@@ -673,7 +704,8 @@ def judge_triggers(result: Judgement, plan: FlightPlan, camera: CameraProfile) -
         for passed in strip_legs(legs):
             released = released_places(passed, plan)
             first = next((leg.start.exposure for leg in passed if leg.start.exposure >= 0), -1)
-            if first < 0 or passed[-1].end.role is not WaypointRole.EXIT:
+            ends = WaypointRole.EXPOSURE if plan.trigger is Trigger.HOVER else WaypointRole.EXIT
+            if first < 0 or passed[-1].end.role not in (ends, WaypointRole.EXIT):
                 result.faults.append(f"a pass of sortie {number} has no first exposure or no exit")
                 continue
             last = max(waypoint.exposure for leg in passed for waypoint in (leg.start, leg.end))
@@ -750,6 +782,13 @@ def broken_promises(
     climb = flight.climb_m_s or (vehicle.climb_m_s if vehicle else np.inf)
     descent = flight.descent_m_s or (vehicle.descent_m_s if vehicle else np.inf)
     broken = list(found.faults)
+    if found.forward_report_error > margin or found.side_told_too_high > margin:
+        broken.append(
+            f"forward overlap told wrong by {found.forward_report_error:.4f}, side overlap too high by "
+            f"{found.side_told_too_high:.4f}"
+        )
+    if found.side_told_too_low > MOST_TOLD_TOO_LOW:
+        broken.append(f"side overlap told too low by {found.side_told_too_low:.4f}")
     if found.forward_overlap < imaging.forward_overlap - margin:
         broken.append(f"forward overlap {found.forward_overlap:.4f} of image {found.forward_at}")
     if found.side_overlap < imaging.side_overlap - margin:
@@ -760,6 +799,8 @@ def broken_promises(
         broken.append(f"height off by {found.strip_height_deviation:.3f} of it in a strip")
     if found.clearance_m < terrain.least_clearance_m - 0.02:
         broken.append(f"clearance {found.clearance_m:.2f} m")
+    if found.clearance_told_m > found.clearance_m + 0.05:
+        broken.append(f"clearance told {found.clearance_told_m:.2f} m, is {found.clearance_m:.2f} m")
     if found.highest_m > flight.greatest_height_above_ground_m + 0.02:
         broken.append(f"{found.highest_m:.2f} m above ground")
     if found.climb_m_s > climb * 1.01 or found.descent_m_s > descent * 1.01:

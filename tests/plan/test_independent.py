@@ -317,7 +317,7 @@ def test_an_image_moved_away_is_noticed() -> None:
     assert good.forward_overlap == pytest.approx(0.8, abs=1e-3)
     assert good.side_overlap == pytest.approx(0.6, abs=1e-3)
     assert good.forward_report_error < 1e-3
-    assert good.side_report_error < 1e-3
+    assert max(good.side_told_too_high, good.side_told_too_low) < 1e-3
 
     north_deg = 0.05 * 2 * along * HEIGHT_M / 111000.0
     latitude = plan.exposures.latitude_deg.copy()
@@ -338,7 +338,7 @@ def test_a_strip_moved_away_is_noticed() -> None:
     plan = made_plan(local_map(46.0, 7.0), 0.2 * 2 * along * HEIGHT_M, 0.44 * 2 * across * HEIGHT_M)
     found = judge(with_overlaps_told(plan, 0.8, 0.6), request(0.8, 0.6), camera(), None)
     assert found.side_overlap == pytest.approx(0.56, abs=1e-3)
-    assert found.side_report_error == pytest.approx(0.04, abs=1e-3)
+    assert found.side_told_too_high == pytest.approx(0.04, abs=1e-3)
     assert any("side overlap" in text for text in broken_promises(found, request(0.8, 0.6)))
 
 
@@ -494,6 +494,9 @@ def test_a_wrong_list_of_exposures_is_noticed() -> None:
     assert "no exit" in faults(replace(plan, sorties=(replace(sortie, waypoints=no_exit),)))
     first_strip = tuple(w for w in sortie.waypoints if w.strip == 0)
     assert "in no sortie" in faults(replace(plan, sorties=(replace(sortie, waypoints=first_strip),)))
+    skew = replace(plan, exposures=replace(plan.exposures, heading_deg=plan.exposures.heading_deg + 0.2))
+    assert "0.20 degrees off its way" in faults(skew)
+    assert "turned by 0.20 degrees" in faults(skew)
     alone = tuple(replace(strip, neighbours=()) for strip in plan.strips)
     assert "lie side by side" in faults(replace(plan, strips=alone))
     assert unlisted_neighbours(replace(plan, strips=alone)) == [(0, 1), (1, 2)]
