@@ -89,7 +89,7 @@ def made_plan(
         areas=(maker.area(exposures * base_m, strips * spacing_m),),
         take_off=TakeOff(latitude_deg=latitude_deg, longitude_deg=longitude_deg, height_ellipsoid_m=GROUND_M),
         strips=tuple(made_strips), exposures=table, sorties=maker.sorties(flights), summary=_summary(len(table)),
-        terrain="", notes=("made by hand",),
+        terrain="made", notes=("made by hand",),
     )  # fmt: skip
 
 

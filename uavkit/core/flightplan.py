@@ -123,8 +123,8 @@ class PlannedExposures:
     forward_overlap: Array
     """Share of the image that the next one of its strip shows, 0 to 1; nan for the last of a strip."""
     side_overlap: Array
-    """Share that the neighbouring strips of one side show: the lesser side where the middle of the image lies in the area,
-    the greater one where only its rim does; nan where there is no neighbour, or the area is not seen."""
+    """Share that the strips beside show: on the lesser side where the middle of the image lies in the area, on the
+    greater one where only its rim does; nan where there is no strip beside, or the area is not seen."""
     gsd_m: Array
     """(n, 3): least, mean and greatest ground distance of a pixel."""
     sees_area: NDArray[np.bool_]
@@ -205,7 +205,10 @@ class FlightPlan:
     sorties: tuple[Sortie, ...]
     summary: PlanSummary
     terrain: str
-    """What the ground was taken from; empty for flat ground at the height of the take-off point."""
+    """What the ground was taken from; empty for flat ground: then all ellipsoidal heights of the plan only count from
+    the take-off point, which has 0."""
+    images_in_turns: bool = False
+    """Triggering goes on between strips; the exposures of turns are not listed."""
     notes: tuple[str, ...] = ()
 
 

@@ -271,6 +271,6 @@ class LocalMap:
         return np.column_stack([latitude, longitude])
 
     def convergence_rad(self, latitude_deg: Array, longitude_deg: Array) -> Array:
-        """Return the meridian convergence (n,): azimuth of the map's north, from true north, is minus this."""
+        """Return the meridian convergence (n,): the azimuth of the map's north, from true north, clockwise."""
         factors = self._projection.get_factors(np.asarray(longitude_deg, float), np.asarray(latitude_deg, float))
         return np.asarray(np.radians(factors.meridian_convergence))

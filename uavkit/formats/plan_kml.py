@@ -1,6 +1,7 @@
 """A flight plan as KML or KMZ, to look at in Google Earth: area, strips, exposures, footprints and the paths flown.
 
-Heights are absolute: above the EGM96 geoid, as KML counts them.
+Heights are absolute: above the EGM96 geoid, as KML counts them; those of a plan without a terrain model count from the
+ground.
 """
 
 from collections.abc import Sequence
@@ -52,8 +53,8 @@ def _document(plan: FlightPlan, footprints_deg: Array | Sequence[Array]) -> str:
     _add_take_off(document, plan)
     for number in range(len(plan.sorties)):
         _add_path(document, plan, number)
-    heights_m = _geoid_heights_m(
-        plan.exposures.latitude_deg, plan.exposures.longitude_deg, plan.exposures.height_ellipsoid_m
+    heights_m = _heights_m(
+        plan, plan.exposures.latitude_deg, plan.exposures.longitude_deg, plan.exposures.height_ellipsoid_m
     )
     _add_strips(document.newfolder(name="Strips"), plan, heights_m)
     _add_exposures(document.newfolder(name="Exposures"), plan, heights_m)
@@ -74,8 +75,15 @@ def _description(plan: FlightPlan) -> str:
     return "\n".join(facts)
 
 
-def _geoid_heights_m(latitude_deg: Array, longitude_deg: Array, height_ellipsoid_m: Array) -> Array:
+def _heights_m(plan: FlightPlan, latitude_deg: Array, longitude_deg: Array, height_ellipsoid_m: Array) -> Array:
+    """Return heights as the document counts them: from the geoid, or from flat ground."""
+    if not plan.terrain:
+        return height_ellipsoid_m
     return np.asarray(height_ellipsoid_m - geoid_undulation_m(latitude_deg, longitude_deg))
+
+
+def _mode(plan: FlightPlan) -> str:
+    return "absolute" if plan.terrain else "relativeToGround"
 
 
 def _add_areas(folder: Any, areas: Sequence[SurveyArea]) -> None:
@@ -112,9 +120,8 @@ def _places(latitude_deg: Array, longitude_deg: Array, height_m: Array) -> list[
 def _add_take_off(document: Any, plan: FlightPlan) -> None:
     start = plan.take_off
     point = document.newpoint(name="Take-off", coords=[(start.longitude_deg, start.latitude_deg)])
-    point.description = f"{start.height_ellipsoid_m:.1f} m above the ellipsoid" + (
-        "; chosen by the planner" if start.chosen else ""
-    )
+    height = f"{start.height_ellipsoid_m:.1f} m above the ellipsoid" if plan.terrain else "height not known"
+    point.description = height + ("; chosen by the planner" if start.chosen else "")
     point.style.iconstyle.icon.href = f"{_ICONS}heliport.png"
     point.style.iconstyle.color, point.style.iconstyle.scale = _TAKE_OFF, 1.1
 
@@ -126,8 +133,8 @@ def _add_path(document: Any, plan: FlightPlan, number: int) -> None:
         np.array([getattr(waypoint, name) for waypoint in waypoints], dtype=np.float64)
         for name in ("latitude_deg", "longitude_deg", "height_ellipsoid_m")
     ]
-    path = document.newlinestring(name=f"Sortie {number + 1}", altitudemode="absolute", extrude=1)
-    path.coords = _places(columns[0], columns[1], _geoid_heights_m(*columns)) if waypoints else []
+    path = document.newlinestring(name=f"Sortie {number + 1}", altitudemode=_mode(plan), extrude=1)
+    path.coords = _places(columns[0], columns[1], _heights_m(plan, *columns)) if waypoints else []
     flight, colour = plan.sorties[number], _PATHS[number % len(_PATHS)]
     path.description = f"{flight.exposures} exposures, {flight.length_m:.0f} m, {flight.duration_s / 60.0:.1f} minutes"
     path.style.linestyle.color, path.style.linestyle.width = colour, 2
@@ -140,7 +147,7 @@ def _add_strips(folder: Any, plan: FlightPlan, heights_m: Array) -> None:
         rows = np.flatnonzero(table.strip == number)
         if len(rows) == 0:
             continue
-        line = folder.newlinestring(name=f"Strip {number + 1}", altitudemode="absolute")
+        line = folder.newlinestring(name=f"Strip {number + 1}", altitudemode=_mode(plan))
         line.coords = _places(table.latitude_deg[rows], table.longitude_deg[rows], heights_m[rows])
         line.description = f"{len(rows)} exposures, base {strip.base_m:.1f} m, direction {strip.direction_deg:.1f} deg"
         line.style.linestyle.color, line.style.linestyle.width = _STRIPS[strip.set_number % 2], 4
@@ -159,7 +166,7 @@ def _add_exposures(folder: Any, plan: FlightPlan, heights_m: Array) -> None:
     for row, (place, strip) in enumerate(zip(places, table.strip.tolist(), strict=True)):
         if strip not in folders:
             folders[strip] = folder.newfolder(name=f"Strip {strip + 1}")
-        point = folders[strip].newpoint(name=f"{row + 1}", coords=[place], altitudemode="absolute")
+        point = folders[strip].newpoint(name=f"{row + 1}", coords=[place], altitudemode=_mode(plan))
         point.description = (
             f"sortie {table.sortie[row] + 1}, {table.time_s[row]:.1f} s, "
             f"{table.height_above_ground_m[row]:.1f} m above ground, heading {table.heading_deg[row]:.1f} deg"

@@ -1,12 +1,14 @@
 """The request of a flight as data: every option with its unit, range and default."""
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
 from uavkit.core.errors import InputError
-from uavkit.formats.options_file import StrictModel, read_toml
+from uavkit.formats.options_file import StrictModel, read_toml, validated
 
 Degrees = Annotated[tuple[float, float], Field(strict=False)]
 """Latitude, longitude."""
@@ -168,15 +170,39 @@ class PlanRequest(StrictModel):
     orbit: OrbitRequest | None = None
 
 
-def read_request(path: Path) -> PlanRequest:
-    """Read a request; raises InputError naming file, key and the nearest known key."""
-    request = read_toml(path, PlanRequest)
-    if not request.name:
-        request = request.model_copy(update={"name": path.stem})
+def request_of(path: Path, given: Mapping[str, Any]) -> PlanRequest:
+    """Return the request in a TOML file, or for an area file, with values by dotted name in place of its own.
+
+    Values that are None are not given. Raises InputError naming what is wrong.
+    """
+    if path.suffix.lower() == ".toml":
+        content = read_toml(path, PlanRequest).model_dump(exclude_unset=True)
+    elif not path.is_file():
+        raise InputError(f"{path}: there is no such file: give an area (KML, GeoJSON, SHP, WKT) or a request (TOML)")
+    else:
+        content = {"area_file": path.name}
+    content.setdefault("name", path.stem)
+    for name, value in given.items():
+        if value is None:
+            continue
+        table, _, key = name.rpartition(".")
+        (content.setdefault(table, {}) if table else content)[key] = value
+        if name in _ONE_OF:
+            content[table].pop(_ONE_OF[name], None)
+    if "camera" not in content:
+        raise InputError(f"{path}: name the camera (--camera); 'uavkit cameras' lists those that are known")
+    request = validated(PlanRequest, content, str(path))
     if bool(request.area_file) == bool(request.areas):
         raise InputError(f"{path}: give area_file or [[areas]], one of them")
     check_request(request, str(path))
     return request
+
+
+_ONE_OF = {
+    "imaging.height_above_ground_m": "gsd_mm",
+    "imaging.gsd_mm": "height_above_ground_m",
+}
+"""What the one of two options given on the command line takes the place of in the file."""
 
 
 def check_request(request: PlanRequest, where: str) -> None:
@@ -189,3 +215,24 @@ def check_request(request: PlanRequest, where: str) -> None:
             raise InputError(f"{where}: the pattern {pattern} needs a table [{pattern}]")
     if request.terrain.follow and not request.terrain.file:
         raise InputError(f"{where}: [terrain] follow needs a terrain model: give file")
+
+
+def request_text(request: PlanRequest) -> str:
+    """Return a request as TOML with all its options, defaults included; what has no value is left out."""
+    content = request.model_dump()
+    tables = {key: value for key, value in content.items() if isinstance(value, dict)}
+    areas = content.pop("areas")
+    lines = [f"{key} = {_toml(value)}" for key, value in content.items() if key not in tables and value is not None]
+    for area in areas:
+        lines += ["", "[[areas]]", *(f"{key} = {_toml(value)}" for key, value in area.items())]
+    for name, table in tables.items():
+        lines += ["", f"[{name}]"]
+        lines += [f"{key} = {_toml(value)}" for key, value in table.items() if value is not None]
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: Any) -> str:
+    """Return plain data as TOML; JSON's texts, numbers and truth values are TOML's too."""
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_toml(part) for part in value)}]"
+    return json.dumps(value, ensure_ascii=False)

@@ -38,6 +38,11 @@ ITEMS_OF_A_SORTIE = 8
 """Beside waypoints and triggers: home, take-off, speed, gimbal, transit, return."""
 
 
+def most_items(request: PlanRequest, vehicle: VehicleProfile | None) -> int:
+    """Return how many mission items a sortie may have."""
+    return request.sorties.most_items or (vehicle.most_mission_items if vehicle is not None else MOST_ITEMS)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Assembled:
     """What a plan is made of."""
@@ -129,7 +134,7 @@ def _spans(
             f"there is no exposure station {first_station} to resume at: the plan has 0 to {len(stations) - 1}"
         )
     asked = request.sorties
-    most = asked.most_items or (vehicle.most_mission_items if vehicle is not None else MOST_ITEMS)
+    most = most_items(request, vehicle)
     items = _running_items(on_map, flies)
     limits = SortieLimits(
         duration_s=most_s,
@@ -137,26 +142,13 @@ def _spans(
         overlap_stations=asked.overlap_images,
     )
     line_of = np.repeat(np.arange(len(on_map)), [len(line) for _, line in on_map])
-    spans = divide(
+    return divide(
         cumulative_times(on_map, times, flies),
         away_times(stations, field, flies),
         items,
         line_of,
         limits,
         max(0, first_station - asked.overlap_images) if first_station else 0,
-    )
-    for begin, end in spans:
-        needed = int(items[end] - items[begin]) + ITEMS_OF_A_SORTIE
-        if needed > most and not asked.split_at_items:
-            raise _too_many_items(request, needed, most)
-    return spans
-
-
-def _too_many_items(request: PlanRequest, needed: int, most: int) -> InputError:
-    other = "trigger = 'distance' needs far fewer" if request.flight.trigger == "hover" else "allow more tolerance"
-    return InputError(
-        f"the mission has about {needed} items, the autopilot holds {most}: divide it ([sorties] "
-        f"split_at_items = true, or --split), or {other}"
     )
 
 
@@ -287,8 +279,7 @@ def _headings(vertices: Sequence[Vertex], path: Array, parts: Sequence[_Part], f
     for k, vertex in enumerate(vertices):
         if vertex.line != HOME and len(parts[vertex.line].line) > 0:
             part = parts[vertex.line]
-            station = max(vertex.station, 0)
-            last = _camera_heading(part.line.rotations[station], part.line.path_m)
+            last = _camera_heading(part.line.rotations[vertex.near_station], part.line.path_m)
         elif k < len(steps) and np.hypot(*steps[k]) > 0.05:
             last = float(np.arctan2(steps[k, 0], steps[k, 1]))
         result[k] = last

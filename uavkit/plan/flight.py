@@ -226,6 +226,8 @@ class Vertex:
     """Number of the line within the plan."""
     station: int = -1
     """Number of the station within that line."""
+    near_station: int = 0
+    """The same, or of the station before, for vertices between stations: by it the vehicle's heading goes."""
     stops: bool = False
 
 
@@ -276,6 +278,7 @@ def _line_vertices(line: StationLine, number: int, flies: Performance) -> list[V
                 speed_m_s=float(speeds[k]),
                 line=number,
                 station=here,
+                near_station=int(np.clip(np.searchsorted(line.station_vertex, k, side="right") - 1, 0, len(line) - 1)),
                 stops=flies.stops and here >= 0,
             )
         )

@@ -19,11 +19,13 @@ from uavkit.core.mission import Mission, MissionCommand, MissionFrame, MissionIt
 from uavkit.core.vehicle import VehicleKind
 from uavkit.plan.mission_exposures import ExpectedExposures, exposures_of
 
-__all__ = ["AUTOPILOTS", "ExpectedExposures", "exposures_of", "item_count", "mission_of"]
+__all__ = ["AUTOPILOTS", "USUAL_AUTOPILOT", "ExpectedExposures", "exposures_of", "item_count", "mission_of"]
 
 AUTOPILOTS = {"ardupilot": 3, "px4": 12, "dji": 0, "other": 0}
 """MAV_AUTOPILOT of each; 0 is a generic one."""
 
+USUAL_AUTOPILOT = "ardupilot"
+"""Without a vehicle."""
 _SPEED_STEP_M_S = 0.05
 """Smaller changes of speed are no item."""
 _HEADING_STEP_DEG = 5.0
@@ -52,6 +54,11 @@ def mission_of(
     flight = _sortie(plan, sortie)
     if altitude_from not in ("take_off", "geoid"):
         raise InputError(f"altitudes count from 'take_off' or 'geoid', not from {altitude_from!r}")
+    if altitude_from == "geoid" and not plan.terrain:
+        raise InputError(
+            f"{plan.name}: without a terrain model the height of the take-off point is not known: let altitudes count "
+            f"from take_off, or give a terrain model"
+        )
     frame = MissionFrame.TAKE_OFF if altitude_from == "take_off" else MissionFrame.GEOID
     start = plan.take_off
     undulation_m = float(geoid_undulation_m(np.array(start.latitude_deg), np.array(start.longitude_deg)))
@@ -60,7 +67,7 @@ def mission_of(
         items=tuple(_items(plan, flight, autopilot, kind, frame)),
         home_latitude_deg=start.latitude_deg,
         home_longitude_deg=start.longitude_deg,
-        home_height_geoid_m=start.height_ellipsoid_m - undulation_m,
+        home_height_geoid_m=start.height_ellipsoid_m - undulation_m if plan.terrain else None,
         cruise_speed_m_s=speed_m_s,
         hover_speed_m_s=speed_m_s,
         firmware=AUTOPILOTS[autopilot],
@@ -193,7 +200,8 @@ def _camera_pitches_deg(plan: FlightPlan, waypoints: Sequence[Waypoint]) -> Arra
     axes_up = -plan.exposures.R_map_from_image[:, 2, 2]
     pitch_deg = np.degrees(np.arcsin(np.clip(axes_up, -1.0, 1.0)))
     pitches = np.full(len(waypoints), np.nan)
-    for run in _strip_runs(waypoints):
+    runs = _strip_runs(waypoints)
+    for run in runs:
         taken = [number for number in run if waypoints[number].exposure >= 0]
         for number in run if taken else ():
             exposure = waypoints[next((other for other in taken if other >= number), taken[-1])].exposure
@@ -215,7 +223,8 @@ def _camera_commands(
         one = _take_one(autopilot)
         return {number: (one,) for number, waypoint in enumerate(waypoints) if waypoint.exposure >= 0}
     commands: dict[int, tuple[MissionItem, ...]] = {}
-    for run in _strip_runs(waypoints):
+    runs = _strip_runs(waypoints)
+    for run in runs:
         taken = [number for number in run if waypoints[number].exposure >= 0]
         if not taken:
             continue
@@ -225,8 +234,9 @@ def _camera_commands(
             continue
         start, stop = _start_and_stop(plan, strip, waypoints[taken[-1]].speed_m_s)
         leaving = next((number for number in run if waypoints[number].role is WaypointRole.EXIT), last)
-        commands[taken[0]] = (start,) if leaving != taken[0] else (start, stop)
-        commands.setdefault(leaving, (stop,))
+        stops = (stop,) if run is runs[-1] or not plan.images_in_turns else ()
+        commands[taken[0]] = (start,) if leaving != taken[0] else (start, *stops)
+        commands.setdefault(leaving, stops)
     return commands
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from uavkit.core.arrays import Array
 from uavkit.core.errors import InputError
 from uavkit.plan.ground import flat_ground
-from uavkit.plan.lines import HeightRule, Mounting, StationLine
+from uavkit.plan.lines import EXIT_BASES, HeightRule, Mounting, StationLine
 from uavkit.plan.strips import StripRequest, StripSet, best_heading, lay_strips
 
 SIMPLER = 0.1
@@ -245,6 +245,10 @@ def _ring(
     right = np.cross(np.array([0.0, 0.0, 1.0]), back)
     right /= np.linalg.norm(right, axis=1)[:, None]
     upright = np.stack([right, np.cross(back, right), back], axis=-1)
+    beyond = 0.0 if mounting.stops else EXIT_BASES  # on towards where the circle closes
+    ends = (centres[0] + beyond * (centres[-1] - centres[0]), centres[-1] + beyond * (centres[0] - centres[-1]))
+    path = centres if mounting.stops else np.concatenate([ends[0][None], centres, ends[1][None]])
+    first = 0 if mounting.stops else 1
     return StationLine(
         area=name,
         set_number=number,
@@ -253,10 +257,10 @@ def _ring(
         rotations=np.ascontiguousarray(upright),
         in_area=np.ones(count, np.bool_),
         base_m=2.0 * np.pi * radius / count,
-        path_m=centres,
-        bends=np.ones(count, np.bool_),
-        station_vertex=np.arange(count, dtype=np.int64),
-        exit_vertex=count - 1,
+        path_m=path,
+        bends=np.ones(len(path), np.bool_),
+        station_vertex=np.arange(first, first + count, dtype=np.int64),
+        exit_vertex=len(path) - 1,
         back_exit_vertex=0,
     )
 

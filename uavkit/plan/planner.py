@@ -13,15 +13,16 @@ from uavkit.core.errors import InputError
 from uavkit.core.flightplan import AreaKind, CoverageMap, FlightPlan, SurveyArea, TakeOff, Trigger
 from uavkit.core.frames import LocalMap
 from uavkit.core.surface import ElevationGrid
-from uavkit.core.vehicle import VehicleProfile
+from uavkit.core.vehicle import VehicleKind, VehicleProfile
 from uavkit.formats.plan_request import PlanRequest, check_request
 from uavkit.plan import checks
-from uavkit.plan.assembly import Assembled, assemble
+from uavkit.plan.assembly import Assembled, assemble, most_items
 from uavkit.plan.flight import Airfield, Performance
 from uavkit.plan.ground import Ground, flat_ground, ground_from_grid
 from uavkit.plan.imaging import Imaging
 from uavkit.plan.lines import HeightRule, Mounting, StationLine
 from uavkit.plan.measured import LineMeasures, coverage_map, covered_shares, measure_lines
+from uavkit.plan.mission import USUAL_AUTOPILOT, item_count
 from uavkit.plan.patterns import (
     Circles,
     Face,
@@ -100,7 +101,9 @@ def plan_survey(
         _map_fences(site, fences, vehicle),
         first_station,
     )
-    return _planned(site, laid, done, vehicle, [note] if note else [])
+    planned = _planned(site, laid, done, vehicle, [note] if note else [])
+    _check_items(request, planned.plan, vehicle)
+    return planned
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -509,9 +512,25 @@ def _planned(
         sorties=done.sorties,
         summary=summary,
         terrain=site.ground.source,
+        images_in_turns=request.flight.images_in_turns,
         notes=tuple([*notes, *done.notes, *_notes(request, summary, site)]),
     )
     return Planned(plan=plan, coverage=laid.coverages[0], local_map=local_map, footprints_deg=done.footprints_deg)
+
+
+def _check_items(request: PlanRequest, plan: FlightPlan, vehicle: VehicleProfile | None) -> None:
+    """Refuse missions that are longer than the autopilot holds."""
+    most = most_items(request, vehicle)
+    autopilot = vehicle.autopilot if vehicle is not None else USUAL_AUTOPILOT
+    kind = vehicle.kind if vehicle is not None else VehicleKind.MULTIROTOR
+    for number in range(len(plan.sorties)):
+        needed = item_count(plan, number, autopilot, kind)
+        if needed > most:
+            other = "trigger by distance" if plan.trigger is Trigger.HOVER else "allow more tolerance in height"
+            raise InputError(
+                f"the mission of sortie {number + 1} has {needed} items, the autopilot holds {most}: divide it "
+                f"([sorties] split_at_items = true, or --split), {other}, or plan a smaller area"
+            )
 
 
 def _notes(request: PlanRequest, summary: Any, site: _Site) -> list[str]:
