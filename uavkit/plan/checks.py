@@ -156,6 +156,11 @@ def check_payload(camera: CameraProfile, vehicle: VehicleProfile | None) -> str:
 def check_lead(vehicle: VehicleProfile | None, request: PlanRequest) -> float:
     """Return the lead-in of the strips, m; raises InputError where a vehicle that must keep flying cannot hover."""
     flight = request.flight
+    if request.pattern == "facade" and flight.trigger == "distance":
+        raise InputError(
+            "pattern = 'facade': its strips go up and down, and autopilots measure the distance between exposures "
+            "across the ground: [flight] trigger = 'hover' or 'time'"
+        )
     if vehicle is not None and vehicle.kind is VehicleKind.FIXED_WING:
         if flight.trigger == "hover":
             raise InputError(

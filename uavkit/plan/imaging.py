@@ -10,6 +10,8 @@ from uavkit.core.camera import CameraProfile, InteriorOrientation, ideal_from_pi
 
 NODES = 11
 """Places on each axis of an image at which it is asked what the image beside it shows."""
+PROBE_NODES = 7
+"""The same while strips are being laid."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,9 +45,17 @@ class Imaging:
     @cached_property
     def directions(self) -> Array:
         """Return the directions (NODES * NODES, 3) in image space of nodes from rim to rim, row by row."""
+        return self._node_directions(NODES)
+
+    @cached_property
+    def probe_directions(self) -> Array:
+        """Return the same for fewer nodes, (PROBE_NODES * PROBE_NODES, 3)."""
+        return self._node_directions(PROBE_NODES)
+
+    def _node_directions(self, nodes: int) -> Array:
         interior = self.interior
-        columns = np.linspace(-0.5, interior.width_px - 0.5, NODES)
-        rows = np.linspace(-0.5, interior.height_px - 0.5, NODES)
+        columns = np.linspace(-0.5, interior.width_px - 0.5, nodes)
+        rows = np.linspace(-0.5, interior.height_px - 0.5, nodes)
         grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         return np.ascontiguousarray(image_directions(grid, interior))
 

@@ -1,12 +1,13 @@
 """How much of each image the images beside it show, on the ground as it is."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from uavkit.core.arrays import Array
 from uavkit.plan.ground import Ground
-from uavkit.plan.imaging import NODES, Imaging
+from uavkit.plan.imaging import Imaging
 from uavkit.plan.kernels import forward_shares, ground_points, side_shares
 from uavkit.plan.lines import StationLine
 
@@ -22,10 +23,16 @@ def points_on_ground(imaging: Imaging, ground: Ground, line: StationLine, direct
     return result
 
 
+def _nodes(points: Array) -> tuple[int, int]:
+    """Return rows and columns of the nodes of ground points (n, m, 3): as many of each."""
+    side = math.isqrt(points.shape[1])
+    return side, side
+
+
 def forward_overlaps(imaging: Imaging, line: StationLine, points: Array) -> Array:
     """Return the share (n,) of each image that the next one shows, of its ground points (n, m, 3); the last: nan."""
     result = np.empty(len(line))
-    shape = (NODES, NODES)
+    shape = _nodes(points)
     forward_shares(points, line.centres_m, line.rotations, imaging.parameters, shape, result)
     return result
 
@@ -56,7 +63,7 @@ class Neighbours:
 def side_overlaps(imaging: Imaging, points: Array, beside: Neighbours) -> Array:
     """Return the share (n,) of images, given by their ground points (n, m, 3), that any image beside them shows."""
     result = np.empty(len(points))
-    shape = (NODES, NODES)
+    shape = _nodes(points)
     side_shares(
         points,
         beside.direction,

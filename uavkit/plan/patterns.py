@@ -157,7 +157,12 @@ def facade_sets(
             begin + np.linspace(0.0, 1.0, 21)[:, None] * (end - begin) + mounting.rule.above_ground_m * axes[:2, 2]
         )
         origin = np.array([*begin, float(np.min(feet)) + face.base_m])
-        lowest = float(np.max(outside)) + face.least_above_ground_m - origin[2]
+        lead = (
+            0.0
+            if mounting.stops
+            else 0.5 * (1.0 - request.forward_overlap) * mounting.imaging.length_m(mounting.rule.above_ground_m)
+        )
+        lowest = float(np.max(outside)) + face.least_above_ground_m - origin[2] + lead
         result.append(
             _facade_set(
                 Region(name=region.name, shape=(length, face.height_m)),

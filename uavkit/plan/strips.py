@@ -16,10 +16,13 @@ from uavkit.plan.overlap import Neighbours, forward_overlaps, points_on_ground, 
 
 ROUNDS = 12
 """Of bringing stations or strips closer until the overlap holds."""
-SPARE = 0.004
+SPARE = 0.005
 """Overlap asked for beyond the request: what the nodes of an image may miss."""
 FIRMLY = 0.985
 """A distance that is too long is shortened by this at least."""
+
+LONGER = 1.04
+"""A row is first tried with the base, and the distance to the next, of the row before, lengthened by this."""
 
 Interval = tuple[float, float]
 
@@ -92,7 +95,7 @@ class _Layout:
         self.bounds = self.polygon.bounds
         across = self.bounds[3] - self.bounds[1]
         refuse_too_many(self.polygon.area / (self.base_m * self.distance_m) + across / self.distance_m, strips.area)
-        self.bases: dict[int, float] = {}
+        self.last_base_m, self.last_distance_m = self.base_m, np.inf
 
     def map_xy(self, u: float, v: float) -> Array:
         return u * self.strips.along + v * self.strips.across
@@ -122,17 +125,17 @@ class _Layout:
 
     def _distance_after(self, row: float, wanted_m: float) -> float:
         """Return the greatest distance to the next row, not above the wanted one, that gives the side overlap."""
-        ask, distance = self.strips.request, wanted_m
+        ask = self.strips.request
         if not ask.keep_overlap:
-            return distance
-        here = None
+            return wanted_m
+        distance = min(wanted_m, LONGER * self.last_distance_m)
         for _ in range(ROUNDS):
             there = row + distance
             union = self._merged([*self.own(row, distance), *self.own(there, distance)])
             if not union:
                 return distance
-            here = self._probe(row, union)
-            share = self._least_side(here, self._probe(there, union))
+            share = self._least_side(self._probe(row, union), self._probe(there, union))
+            self.last_distance_m = distance
             if np.isnan(share) or share >= ask.side_overlap + SPARE or self._exact(share, ask.side_overlap):
                 return distance
             factor = (1.0 - ask.side_overlap - SPARE) / max(1.0 - share, 1e-3)
@@ -152,7 +155,7 @@ class _Layout:
         """Return lines of a row with stations and their ground points, for the comparison with another row."""
         lines = [self._line(row, interval, []) for interval in intervals]
         imaging, ground = self.strips.mounting.imaging, self.strips.mounting.ground
-        return [(line, points_on_ground(imaging, ground, line)) for line in lines]
+        return [(line, points_on_ground(imaging, ground, line, imaging.probe_directions)) for line in lines]
 
     def _least_side(self, here: list[tuple[StationLine, Array]], there: list[tuple[StationLine, Array]]) -> float:
         least = np.nan
@@ -217,13 +220,14 @@ class _Layout:
         Where the vehicle stops for every image the base changes along the line, else the shortest one serves it all.
         """
         ask = self.strips.request
-        along = self._evenly(interval, self.base_m)
+        along = self._evenly(interval, min(self.base_m, LONGER * self.last_base_m))
         for turn in range(ROUNDS):
             line = self._stations(row, along, own)
             if not ask.keep_overlap or len(line) < 2:
                 return line
             shares = self._forward(line)
             least = float(np.min(shares))
+            self.last_base_m = line.base_m
             if least >= ask.forward_overlap + 0.5 * SPARE or self._exact(least, ask.forward_overlap):
                 return line
             factors = (1.0 - ask.forward_overlap - SPARE) / np.maximum(1.0 - shares, 1e-3)
@@ -237,7 +241,7 @@ class _Layout:
     def _forward(self, line: StationLine) -> Array:
         """Return the lesser share (n - 1,) that two neighbours show of one another, whichever is flown first."""
         imaging = self.strips.mounting.imaging
-        points = points_on_ground(imaging, self.strips.mounting.ground, line)
+        points = points_on_ground(imaging, self.strips.mounting.ground, line, imaging.probe_directions)
         ahead = forward_overlaps(imaging, line, points)[:-1]
         back = replace(
             line,
