@@ -358,8 +358,9 @@ def _evidence(
 
 
 def _common_by_tone(scene: _Scene, views: list[_EventView], rough: SequenceAlignment) -> AffineTransformation | None:
-    """Return the transformation in which pairs that are sure by time have the same tone: detail may be too faint."""
-    pairs = [(views[j].picture, scene.stills[scene.infos[i].name].reduced) for i, j in rough.pairs.tolist()]
+    """Return the transformation in which pairs that are likely by time have the same tone: detail may be too faint."""
+    likely = np.argwhere(rough.matrix > 0.5).tolist()
+    pairs = [(views[j].picture, scene.stills[scene.infos[i].name].reduced) for i, j in likely]
     if len(pairs) < LEAST_BY_TONE:
         return None
     some = pairs[:: max(1, len(pairs) // MOST_BY_TONE)]

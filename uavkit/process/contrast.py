@@ -37,3 +37,17 @@ def stretched(image: Grey) -> Grey:
     spread = float(detail.std())
     gain = STRETCHED_TO / spread if spread >= LEAST_CONTRAST else 0.0
     return np.asarray(np.clip(np.rint(128.0 + gain * detail), 0, 255), np.uint8)
+
+
+def visible(still: Grey) -> Grey:
+    """Return a still as it is, or stretched where it shows faint ground; judged at about the size of a video picture.
+
+    Matching works on grey values of some contrast: what counts as texture is a number of grey values.
+    """
+    reduction = max(1, round(still.shape[1] / JUDGED_AT_PX))
+    size = still.shape[1] // reduction, still.shape[0] // reduction
+    small = np.asarray(cv2.resize(still, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return stretched(still) if min(size) > 64 and contrast(small) < FAINT else still
+
+
+JUDGED_AT_PX = 640

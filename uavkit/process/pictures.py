@@ -8,6 +8,7 @@ from threading import Lock
 from uavkit.core.arrays import Image
 from uavkit.core.devices import StillSource
 from uavkit.core.errors import InputError
+from uavkit.process.contrast import visible
 from uavkit.process.pyramid import ImagePyramid, build_pyramid
 
 _M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8  # of glibc's malloc.h
@@ -64,10 +65,10 @@ class PictureStore:
 
 
 class PyramidStore:
-    """Image pyramids of the stills in use, a few at a time."""
+    """Image pyramids of the stills in use, a few at a time; stills of faint ground are stretched."""
 
     def __init__(self, store: PictureStore, capacity: int = 16, levels: int = 4) -> None:
-        self._build = lru_cache(maxsize=capacity)(lambda index: build_pyramid(store.grey(index), levels))
+        self._build = lru_cache(maxsize=capacity)(lambda index: build_pyramid(visible(store.grey(index)), levels))
 
     def get(self, index: int) -> ImagePyramid:
         """Return the pyramid of a still by its row."""

@@ -27,6 +27,10 @@ MOST_SHIFT_PX = 40
 LEAST_WINDOWS = 0.5
 """Share of the windows that repeat themselves for the picture to be so."""
 REDUCTION = 4
+REACH_PX = 80
+"""Longest shift of the whole picture, along columns and rows."""
+RIM_PX = 24
+"""Left out: smoothing falsifies it."""
 STAGES = (
     (16.0, 60.0, cv2.MOTION_TRANSLATION),
     (10.0, 40.0, cv2.MOTION_EUCLIDEAN),
@@ -74,19 +78,49 @@ def _repetition(window: Small) -> tuple[tuple[int, int], float]:
     return (int(reach[column]), int(reach[row])), float(part[row, column])
 
 
-def wide_motion(before: Grey, after: Grey) -> Array:
-    """Return after_from_before (2, 3), affine, in pixels, by tone of wide extent alone.
+def wide_motion(before: Grey, after: Grey) -> tuple[Array, float]:
+    """Return after_from_before (2, 3), affine, in pixels, by tone of wide extent alone, and the tone's correlation.
 
-    Good to some pixels: it tells which period is meant. A stage that does not converge is left out.
+    Good to some pixels: it tells which period is meant. A stage that does not converge is left out. The correlation
+    is 0 where there is no tone.
     """
     one, two = _reduced(before), _reduced(after)
-    motion = np.eye(2, 3)
+    motion = _wide_shift(*(_band(image, *STAGES[0][:2]) for image in (one, two)))
     for smoothing_px, wide_px, free in STAGES:
         bands = _band(one, smoothing_px, wide_px), _band(two, smoothing_px, wide_px)
         motion = _registered(*bands, motion, (smoothing_px, free))
+    likeness = _likeness(*bands, motion)
     half = 0.5 * (REDUCTION - 1)
     shift = REDUCTION * motion[:, 2] + half - motion[:, :2] @ np.full(2, half)
-    return np.column_stack([motion[:, :2], shift])
+    return np.column_stack([motion[:, :2], shift]), likeness
+
+
+def _likeness(before: Small, after: Small, motion: Array) -> float:
+    """Return the correlation of what both small pictures show; 0 where one shows nothing."""
+    rim = RIM_PX // REDUCTION
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    size = before.shape[::-1]
+    moved = cv2.warpAffine(after, motion, size, flags=flags, borderValue=float("nan"))[rim:-rim, rim:-rim]
+    both = np.isfinite(moved)
+    one, two = before[rim:-rim, rim:-rim][both], moved[both]
+    if both.mean() < LEAST_COMMON or min(one.std(), two.std()) < LEAST_TONE:
+        return 0.0
+    return float(np.corrcoef(one, two)[0, 1])
+
+
+LEAST_COMMON = 0.25
+"""Share of a picture that the other must show."""
+LEAST_TONE = 0.3
+"""Standard deviation of tone, grey values; less is noise."""
+
+
+def _wide_shift(before: Small, after: Small) -> Array:
+    """Return after_from_before (2, 3), a shift of small pictures, by the highest correlation within ``REACH_PX``."""
+    reach, rim = REACH_PX // REDUCTION, RIM_PX // REDUCTION
+    inner = before[rim + reach : -rim - reach, rim + reach : -rim - reach]
+    likeness = cv2.matchTemplate(after[rim:-rim, rim:-rim], inner, cv2.TM_CCOEFF_NORMED)
+    row, column = np.unravel_index(int(np.argmax(likeness)), likeness.shape)
+    return np.array([[1.0, 0.0, column - reach], [0.0, 1.0, row - reach]])
 
 
 def _reduced(image: Grey) -> Small:

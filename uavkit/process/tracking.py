@@ -446,7 +446,10 @@ def _alignments(state: TrackState, picture: TimedPicture, judge: _Judge, rng: np
     Tone of wide extent tells the motion to some pixels. About it, and at the shifts at which the ground repeats itself
     about the best, all points together are compared: a single one fits at each period.
     """
-    ways = _climbed(state, judge, _likely_motions(state, judge, wide_motion(state.last_image, picture.image)), rng)
+    wide, likeness = wide_motion(state.last_image, picture.image)
+    if likeness < _LEAST_LIKENESS:
+        return []
+    ways = _climbed(state, judge, _likely_motions(state, judge, wide), rng)
     kept: list[_Alignment] = []
     for way in ways:
         same = any(_median_distance(way.found.points_px, one.found.points_px) < _SAME_PX for one in kept)
@@ -471,6 +474,8 @@ def _climbed(state: TrackState, judge: _Judge, motions: list[Array], rng: np.ran
     return ways
 
 
+_LEAST_LIKENESS = 0.5
+"""Correlation of tone below which it tells nothing, and any period would be a guess."""
 _MOST_CLIMBS = 6
 _GRID_PX = np.arange(-9.0, 9.5, 3.0)
 """About the motion that tone of wide extent tells, along columns and rows."""
