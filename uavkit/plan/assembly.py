@@ -78,17 +78,21 @@ def assemble(
     measures: Sequence[LineMeasures],
     field: Airfield,
     flies: Performance,
-    vehicle: VehicleProfile | None,
+    flown_by: tuple[VehicleProfile | None, int],
     fences: checks.MapFences,
     first_station: int,
 ) -> Assembled:
-    """Return the parts of a plan over lines in the order of flight, from a station on."""
+    """Return the parts of a plan over lines in the order of flight, from a station on.
+
+    flown_by: the vehicle, and about how many mission items a sortie may have where it may be divided by them.
+    """
+    vehicle, items = flown_by
     on_map = [(member, line.moved(sets[member].axes, sets[member].origin_m)) for member, line in flown]
     starts = stations_of([line for _, line in on_map])
     most_s = vehicle.endurance_s * (1.0 - request.sorties.reserve) if vehicle is not None else float("inf")
     aimed_s = most_s
     while True:  # the division goes by estimates of the way there and back
-        spans = _spans(request, on_map, field, flies, (vehicle, aimed_s), first_station)
+        spans = _spans(request, on_map, field, flies, (aimed_s, items), first_station)
         parts = _parts(sets, flown, measures, starts, spans)
         sorties, times = _sorties(parts, field, flies, fences)
         longest_s = max(sortie.record.duration_s for sortie in sorties)
@@ -105,7 +109,7 @@ def assemble(
         summary=_summary(request, sets, parts, sorties, exposures, flies, min(clearance)),
         footprints_deg=footprints,
         home_m=field.home_m,
-        notes=tuple(_notes(sorties, vehicle, flies, request)),
+        notes=tuple(_notes(sorties, vehicle, flies, request, field.clearance_m)),
     )
 
 
@@ -122,11 +126,11 @@ def _spans(
     on_map: Sequence[tuple[int, StationLine]],
     field: Airfield,
     flies: Performance,
-    limit: tuple[VehicleProfile | None, float],
+    limit: tuple[float, int],
     first_station: int,
 ) -> list[tuple[int, int]]:
-    """Return first and last station of each sortie of a vehicle that may take no longer than a time (s)."""
-    vehicle, most_s = limit
+    """Return first and last station of each sortie, which may take no longer than a time (s) and a number of items."""
+    most_s, most = limit
     times = [line_times(line, flies) for _, line in on_map]
     stations = np.concatenate([line.centres_m for _, line in on_map])
     if not 0 <= first_station < len(stations):
@@ -134,7 +138,6 @@ def _spans(
             f"there is no exposure station {first_station} to resume at: the plan has 0 to {len(stations) - 1}"
         )
     asked = request.sorties
-    most = most_items(request, vehicle)
     items = _running_items(on_map, flies)
     limits = SortieLimits(
         duration_s=most_s,
@@ -420,7 +423,11 @@ def _least_and_mean(shares: Array) -> tuple[float, float]:
 
 
 def _notes(
-    sorties: Sequence[_Flown], vehicle: VehicleProfile | None, flies: Performance, request: PlanRequest
+    sorties: Sequence[_Flown],
+    vehicle: VehicleProfile | None,
+    flies: Performance,
+    request: PlanRequest,
+    clearance_m: float,
 ) -> list[str]:
     notes = []
     if vehicle is None:
@@ -428,12 +435,11 @@ def _notes(
     asked = request.flight.speed_m_s
     if asked is None:
         notes.append(f"speed on the strips: {flies.speed_m_s:.1f} m/s")
-    highest = max(vertex.xyz_m[2] for sortie in sorties for vertex in sortie.vertices)
-    level = max(sortie.record.waypoints[-1].height_above_takeoff_m for sortie in sorties)
-    low = min(vertex.xyz_m[2] for sortie in sorties for vertex in sortie.vertices)
-    if highest - low > 1.0:
+    points = [point for sortie in sorties for point in sortie.record.waypoints]
+    level = max(point.height_above_takeoff_m - point.height_above_ground_m for point in points) + clearance_m
+    if level > 1.0:
         notes.append(
-            f"set the autopilot's return height to {level:.0f} m above the take-off point at least: it decides itself "
-            f"how high it flies home"
+            f"set the autopilot's return height to {max(level, 15.0):.0f} m above the take-off point at least: it "
+            f"decides itself how high it flies home, also when a link is lost"
         )
     return notes

@@ -90,20 +90,27 @@ def plan_survey(
     note = checks.check_payload(camera, vehicle)
     laid = _laid_well(site, workers or os.cpu_count() or 1)
     performance = _performance(site, laid, vehicle)
-    done = assemble(
-        site.request,
-        laid.sets,
-        laid.flown,
-        laid.measures,
-        _airfield(site, laid),
-        performance,
-        vehicle,
-        _map_fences(site, fences, vehicle),
-        first_station,
-    )
-    planned = _planned(site, laid, done, vehicle, [note] if note else [])
-    _check_items(request, planned.plan, vehicle)
-    return planned
+    most = most_items(request, vehicle)
+    aimed = most
+    while True:  # the division goes by estimates of the number of items
+        done = assemble(
+            site.request,
+            laid.sets,
+            laid.flown,
+            laid.measures,
+            _airfield(site, laid),
+            performance,
+            (vehicle, aimed),
+            _map_fences(site, fences, vehicle),
+            first_station,
+        )
+        planned = _planned(site, laid, done, vehicle, [note] if note else [])
+        longest = _longest_mission(planned.plan, vehicle)
+        if longest <= most:
+            return planned
+        if not request.sorties.split_at_items or aimed < 30:
+            raise _too_many_items(planned.plan, longest, most)
+        aimed = int(aimed * most / longest) - 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -518,19 +525,19 @@ def _planned(
     return Planned(plan=plan, coverage=laid.coverages[0], local_map=local_map, footprints_deg=done.footprints_deg)
 
 
-def _check_items(request: PlanRequest, plan: FlightPlan, vehicle: VehicleProfile | None) -> None:
-    """Refuse missions that are longer than the autopilot holds."""
-    most = most_items(request, vehicle)
+def _longest_mission(plan: FlightPlan, vehicle: VehicleProfile | None) -> int:
+    """Return the number of mission items of the sortie that has most."""
     autopilot = vehicle.autopilot if vehicle is not None else USUAL_AUTOPILOT
     kind = vehicle.kind if vehicle is not None else VehicleKind.MULTIROTOR
-    for number in range(len(plan.sorties)):
-        needed = item_count(plan, number, autopilot, kind)
-        if needed > most:
-            other = "trigger by distance" if plan.trigger is Trigger.HOVER else "allow more tolerance in height"
-            raise InputError(
-                f"the mission of sortie {number + 1} has {needed} items, the autopilot holds {most}: divide it "
-                f"([sorties] split_at_items = true, or --split), {other}, or plan a smaller area"
-            )
+    return max(item_count(plan, number, autopilot, kind) for number in range(len(plan.sorties)))
+
+
+def _too_many_items(plan: FlightPlan, needed: int, most: int) -> InputError:
+    other = "trigger by distance" if plan.trigger is Trigger.HOVER else "allow more tolerance in height"
+    return InputError(
+        f"the mission has {needed} items, the autopilot holds {most}: divide it ([sorties] split_at_items = true, or "
+        f"--split), {other}, or plan a smaller area"
+    )
 
 
 def _notes(request: PlanRequest, summary: Any, site: _Site) -> list[str]:
