@@ -49,6 +49,7 @@ tbody th { font-weight: 400; }
 details { margin: 1rem 0; } summary { cursor: pointer; font-weight: 600; padding: .2rem 0; }
 @page { margin: 16mm 14mm; }
 @media print { body { padding: 0; font-size: 10pt; max-width: none; } h2, h3 { break-after: avoid; }
+  figure img { max-width: 90%; max-height: 205mm; width: auto !important; } th, td { padding: .18rem .5rem; }
   tr, .verdict li, .key, .short { break-inside: avoid; }
   .scroll { overflow: visible; } thead { display: table-header-group; }
   details::details-content { content-visibility: visible; block-size: auto; } .wide table { font-size: 6.4pt; }
