@@ -72,8 +72,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Photogrammetric surveys with low-cost drones. Try it: uavkit demo OUT. Usual order: ingest, process, report; "
-    "'run' does whatever is out of date.",
+    help="Photogrammetric surveys with low-cost drones. Try it: uavkit demo OUT. Usual order: plan, ingest, process, "
+    "report; 'run' does whatever is out of date.",
 )
 
 Survey = Annotated[Path, typer.Argument(help="Folder of the survey.", show_default=False)]
@@ -313,6 +313,137 @@ def cameras() -> None:
         size = f"{profile.interior.width_px} x {profile.interior.height_px} px"
         typer.echo(
             f"{profile.name:24} {profile.maker} {', '.join(profile.models)}; {size}, {profile.focal_length_mm:g} mm"
+        )
+
+
+def _share(text: str | None) -> float | None:
+    """Return a share from "80%" or "0.8"."""
+    if text is None:
+        return None
+    try:
+        value = float(text.strip().removesuffix("%").strip()) * (0.01 if text.strip().endswith("%") else 1.0)
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is no share: write 80% or 0.8") from None
+    if not 0.0 <= value < 1.0:
+        raise typer.BadParameter(
+            f"{text!r}: an overlap is at least 0 and less than 100 %; with more no image would move on"
+        )
+    return value
+
+
+Overlap = Annotated[str | None, typer.Option(help="Share of an image that the next one (strip) shows, like 80%.")]
+
+
+@app.command()
+def plan(
+    area: Annotated[
+        Path, typer.Argument(help="Area (KML, KMZ, GeoJSON, SHP, WKT), or a request (TOML).", show_default=False)
+    ],
+    camera: Annotated[str | None, typer.Option(help="As 'uavkit cameras' lists it, or a camera file.")] = None,
+    height_above_ground: Annotated[float | None, typer.Option(help="m; give this or --gsd-mm.")] = None,
+    gsd_mm: Annotated[float | None, typer.Option(help="Ground distance of a pixel, mm.")] = None,
+    forward_overlap: Overlap = None,
+    side_overlap: Overlap = None,
+    terrain: Annotated[Path | None, typer.Option(help="Elevation model: GeoTIFF, .hgt, ESRI ASC.")] = None,
+    terrain_datum: Annotated[
+        Literal["ellipsoid", "geoid"] | None, typer.Option(help="What its heights count from, where it does not tell.")
+    ] = None,
+    follow: Annotated[bool, typer.Option("--follow", help="Follow the ground instead of one altitude.")] = False,
+    keep_overlap: Annotated[
+        bool | None,
+        typer.Option("--keep-overlap/--flat-overlap", help="Keep the overlap on slopes, or on flat ground only."),
+    ] = None,
+    direction: Annotated[str | None, typer.Option(help="Of the strips, degrees from north, or best.")] = None,
+    trigger: Annotated[
+        Literal["distance", "time", "hover"] | None, typer.Option(help="What takes the pictures.")
+    ] = None,
+    speed: Annotated[float | None, typer.Option(help="On the strips, m/s.")] = None,
+    take_off: Annotated[str | None, typer.Option(help="Take-off point: latitude,longitude.")] = None,
+    vehicle: Annotated[str | None, typer.Option(help="As 'uavkit vehicles' lists it, or a vehicle file.")] = None,
+    pattern: Annotated[
+        Literal["polygon", "cross_grid"] | None, typer.Option(help="Others by a request: corridor, facade, orbit.")
+    ] = None,
+    split: Annotated[bool, typer.Option("--split", help="Divide where the autopilot holds no more items.")] = False,
+    resume_after: Annotated[int | None, typer.Option(help="Last exposure station taken: plan the rest.", min=0)] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the plan; else its name.")] = None,
+    survey: Annotated[Path | None, typer.Option(help="Survey in whose folder the plan is to lie.")] = None,
+) -> None:
+    """Plan a flight: strips whose overlap holds on the ground as it is, and the files that ground stations fly."""
+    from uavkit import workflow
+    from uavkit.formats.plan_request import request_of
+
+    given = {
+        "camera": camera,
+        "vehicle": vehicle,
+        "pattern": pattern,
+        "imaging.height_above_ground_m": height_above_ground,
+        "imaging.gsd_mm": gsd_mm,
+        "imaging.forward_overlap": _share(forward_overlap),
+        "imaging.side_overlap": _share(side_overlap),
+        "imaging.keep_overlap": keep_overlap,
+        "imaging.direction_deg": _direction(direction),
+        "terrain.file": str(terrain.absolute()) if terrain else None,
+        "terrain.height_datum": terrain_datum,
+        "terrain.follow": follow or None,
+        "flight.trigger": trigger,
+        "flight.speed_m_s": speed,
+        "flight.take_off_deg": _place(take_off),
+        "sorties.split_at_items": split or None,
+    }
+    request = request_of(area, given)
+    folder = out or (survey / "plan" if survey else Path(request.name))
+    first = 0 if resume_after is None else resume_after + 1
+    made = workflow.plan(request, area.parent, folder, first)
+    _say(made.lines)
+    typer.echo(f"Plan: {folder}\nPage: {made.page}")
+
+
+def _direction(text: str | None) -> float | str | None:
+    if text is None or text == "best":
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        raise typer.BadParameter(f"--direction {text!r}: give degrees from north, or best") from None
+
+
+def _place(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    try:
+        latitude, longitude = (float(part) for part in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"--take-off {text!r}: give latitude,longitude in degrees") from None
+    return latitude, longitude
+
+
+@app.command()
+def check_plan(
+    file: Annotated[Path, typer.Argument(help=".plan, .waypoints or .flightplan.json.", show_default=False)],
+    camera: Annotated[str, typer.Option(help="As 'uavkit cameras' lists it, or a camera file.", show_default=False)],
+    terrain: Annotated[Path | None, typer.Option(help="Elevation model: GeoTIFF, .hgt, ESRI ASC.")] = None,
+    terrain_datum: Annotated[
+        Literal["ellipsoid", "geoid"] | None, typer.Option(help="What its heights count from, where it does not tell.")
+    ] = None,
+    speed: Annotated[float | None, typer.Option(help="At the start, m/s, where the plan tells none.")] = None,
+) -> None:
+    """Tell what the images of a plan will show: overlaps, ground distances, clearance. Any ground station's plan."""
+    from uavkit import workflow
+    from uavkit.formats.plan_request import TerrainRequest
+
+    ground = TerrainRequest(file=str(terrain) if terrain else "", height_datum=terrain_datum or "")
+    _say(workflow.check_plan(file, camera, ground, speed))
+
+
+@app.command()
+def vehicles() -> None:
+    """List the vehicles that are known."""
+    from uavkit import workflow
+
+    for profile in workflow.vehicles():
+        typer.echo(
+            f"{profile.name:28} {profile.kind.value}, {profile.endurance_s / 60.0:.0f} min, {profile.payload_g:g} g, "
+            f"{profile.speed_m_s:g} m/s"
         )
 
 

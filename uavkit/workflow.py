@@ -2,9 +2,10 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from uavkit.core.block import Block
 from uavkit.core.camera import CameraProfile
@@ -23,6 +24,10 @@ from uavkit.formats.positions_file import ImagePositions, read_image_positions
 from uavkit.formats.video import FileVideoSource
 from uavkit.project import IngestOptions, Manifest, Original, Project, Stage, Standing
 
+if TYPE_CHECKING:
+    from uavkit.core.vehicle import VehicleProfile
+    from uavkit.formats.plan_request import PlanRequest, TerrainRequest
+
 SIMULATION_LABEL = "simulation.json"
 """Beside simulated stills: which flight they repeat. It holds no truth."""
 AS_IN_THE_PAPER: Mapping[str, Any] = {
@@ -33,6 +38,16 @@ AS_IN_THE_PAPER: Mapping[str, Any] = {
     "control_points": 3,
 }
 """Options of a simulated flight that is like one of the paper's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanMade:
+    """What to tell of a plan."""
+
+    lines: list[str]
+    page: Path
+
+
 DEMO: Mapping[str, Any] = {
     "flight": "trace",
     "scale": 0.25,
@@ -55,6 +70,36 @@ def simulate(out: Path, values: Mapping[str, Any], progress: Progress = silent) 
         label["flight"] = None  # another site or other positions: the paper has no such flight
     write_text(made.stills / SIMULATION_LABEL, json.dumps(label) + "\n")
     return " ".join(["uavkit ingest SURVEY", *(f"{name} {path}" for name, path in ingest_arguments(made, options))])
+
+
+def plan(source: "PlanRequest", beside: Path, out: Path, first_station: int = 0) -> "PlanMade":
+    """Plan a flight by a request whose paths count from a folder, and write its files to a folder."""
+    from uavkit.plan.inputs import read_inputs, self_contained
+    from uavkit.plan.outputs import refuse_other_contents, write_outputs
+    from uavkit.plan.planner import plan_survey
+    from uavkit.plan.tables import summary_lines
+
+    refuse_other_contents(out)
+    found = read_inputs(source, beside)
+    planned = plan_survey(
+        source, found.areas, found.camera, found.elevation, found.vehicle, found.fences, first_station=first_station
+    )
+    left_out = write_outputs(out, planned, self_contained(source, beside, found), found.elevation, found.vehicle)
+    return PlanMade(lines=[*summary_lines(planned, source), *left_out], page=out / f"{planned.plan.name}.html")
+
+
+def check_plan(path: Path, camera: str, terrain: "TerrainRequest", speed_m_s: float | None = None) -> list[str]:
+    """Tell in lines what a plan of ours, a .plan or a .waypoints gives with a camera."""
+    from uavkit.plan.checking import checked_lines
+
+    return checked_lines(path, load_camera(camera), terrain, speed_m_s)
+
+
+def vehicles() -> list["VehicleProfile"]:
+    """Return the profiles of all vehicles."""
+    from uavkit.formats.vehicle_profiles import list_vehicles, load_vehicle
+
+    return [load_vehicle(name) for name in list_vehicles()]
 
 
 def begin_survey(project: Project, originals: Mapping[str, Path], options: IngestOptions) -> None:

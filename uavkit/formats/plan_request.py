@@ -187,7 +187,7 @@ def request_of(path: Path, given: Mapping[str, Any]) -> PlanRequest:
             continue
         table, _, key = name.rpartition(".")
         (content.setdefault(table, {}) if table else content)[key] = value
-        if name in _ONE_OF:
+        if name in _ONE_OF and given.get(f"{table}.{_ONE_OF[name]}") is None:
             content[table].pop(_ONE_OF[name], None)
     if "camera" not in content:
         raise InputError(f"{path}: name the camera (--camera); 'uavkit cameras' lists those that are known")
