@@ -137,6 +137,11 @@ def test_cells_seen_too_little_stand_out() -> None:
     blue = int(np.sum(np.all(picture(pictures[0]) != 255, axis=2)))
     assert in_few - key > 0.5 * share * blue  # beside the patch of the colour bar
     assert in_unseen == key
+    rows, columns = np.nonzero(np.all(picture(pictures[1]) == TOO_FEW, axis=2))
+    on_map = columns < 0.8 * picture(pictures[1]).shape[1]  # right of it is the colour bar
+    middle = 0.5 * np.array(picture(pictures[1]).shape[:2])
+    assert rows[on_map].mean() > middle[0]  # row 0 of the map is the southernmost
+    assert columns[on_map].mean() < middle[1]
     assert coloured(pictures[2], UNSEEN) - coloured(pictures[0], UNSEEN) > 0.5 * share * blue
 
 

@@ -6,7 +6,9 @@ import json
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -91,6 +93,7 @@ def test_page_is_whole_and_alone(tmp_path: Path) -> None:
     assert "Second note." in page.text
     for figure in ("80.0 / 80.0", "60.0 / 60.0", "9.0 / 10.0 / 11.0", "3600 m²", "90.0 %", "500 m", "41"):
         assert figure in page.text
+    assert "Missed Area seen by 4 images or more: 90.0 %, asked for: 100 %." in page.text
     assert "level with the take-off point" in page.text
     assert len(page.images) == 4
     for data in page.images:
@@ -164,8 +167,43 @@ def test_figures_that_do_not_exist_are_left_out_or_dashes() -> None:
     assert not any("blur" in name or "video" in name for name in names)
     summary = replace(planned.plan.summary, side_overlap=(float("nan"), float("nan")), motion_blur_px=0.4)
     rows = key_table(replace(planned, plan=replace(planned.plan, summary=summary)), made_request()).rows
-    assert ("Side overlap, least / mean [%]", "– / –", "") in rows
-    assert ("Motion blur [px]", "0.40", "1 or less") in rows
+    assert ("Side overlap, least / mean [%]", "– / –", "", "") in rows
+    assert ("Motion blur [px]", "0.40", "1 or less", "yes") in rows
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"forward_overlap": (0.789, 0.82)}, "Forward"),
+        ({"side_overlap": (0.589, 0.62)}, "Side"),
+        ({"least_clearance_m": 4.9}, "Least clearance"),
+        ({"least_images": 3}, "Fewest"),
+        ({"covered": 0.999}, "Area seen by one"),
+        ({"motion_blur_px": 1.1}, "Motion blur"),
+        ({"video_motion_px": 12.1}, "Motion between"),
+    ],
+)
+def test_what_is_missed_is_said(change: dict[str, Any], name: str) -> None:
+    planned = made_planned()
+    good = {"covered_enough": 1.0, "motion_blur_px": 1.0, "video_motion_px": 12.0, "forward_overlap": (0.791, 0.8)}
+    well = replace(planned, plan=replace(planned.plan, summary=replace(planned.plan.summary, **good)))
+    assert not any("missed" in line for line in summary_lines(well, made_request()))
+    badly = replace(planned, plan=replace(planned.plan, summary=replace(planned.plan.summary, **{**good, **change})))
+    missed = [line for line in summary_lines(badly, made_request()) if "missed" in line]
+    assert len(missed) == 1
+    assert missed[0].strip().startswith(name)
+    assert [row[0] for row in key_table(badly, made_request()).rows if row[3] == "missed"] == [
+        missed[0][2:].split("  ")[0]
+    ]
+
+
+def test_vertical_strips_go_up_and_down() -> None:
+    plan = made_plan(strips=2, exposures=4)
+    exposures = plan.exposures
+    still = np.zeros(len(exposures))
+    heights = 40.0 + np.array([0.0, 5.0, 10.0, 15.0, 15.0, 10.0, 5.0, 0.0])
+    wall = replace(exposures, latitude_deg=still + 35.8, longitude_deg=still + 139.65, height_ellipsoid_m=heights)
+    assert [row[2] for row in strips_table(replace(plan, exposures=wall)).rows] == ["up", "down"]
 
 
 def test_sorties_and_strips_are_counted() -> None:

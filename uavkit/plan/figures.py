@@ -70,12 +70,14 @@ def plan_sheet(scene: Scene) -> Figure:
         figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.1, wspace=0.03, hspace=0.03)
         grid = figure.add_gridspec(3, 2, height_ratios=[2.7, 0.8, 0.4])
         draw_plan(figure.add_subplot(grid[0, 0]), scene)
-        draw_coverage(figure.add_subplot(grid[0, 1]), scene)
+        coverage = figure.add_subplot(grid[0, 1])
+        draw_coverage(coverage, scene)
+        coverage.set_title("Images that see each place", pad=20.0 if scene.is_facade else 6.0)
         sortie = shown_sorties(scene, 1)[0]
         upper = figure.add_subplot(grid[1, :])
         draw_profile(upper, figure.add_subplot(grid[2, :], sharex=upper), scene, sortie)
-        if len(scene.plan.sorties) > 1:
-            upper.set_title(f"Sortie {sortie + 1} of {len(scene.plan.sorties)}", loc="left")
+        which = f" of sortie {sortie + 1} of {len(scene.plan.sorties)}" if len(scene.plan.sorties) > 1 else ""
+        upper.set_title(f"Path{which} above the ground; dashed: least clearance asked for", loc="left")
         summary = scene.plan.summary
         figure.suptitle(
             f"{scene.plan.name}: {summary.images} images, {summary.strips} strips, {summary.length_m / 1e3:.1f} km, "

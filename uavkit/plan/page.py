@@ -30,7 +30,7 @@ def write_plan_page(
     sources = tables.source_lines(planned, request, elevation)
     body = [
         _headline(planned, request, elevation),
-        _notes(plan.notes),
+        _watch(planned, request),
         section("Figures", table_html(tables.key_table(planned, request))),
         section("The flight", pictures["plan"], *(_paragraph(line) for line in sources)),
         section("Coverage", pictures["coverage"]),
@@ -129,14 +129,21 @@ def _paragraph(text: str) -> str:
     return f"<p>{escape(text)}</p>"
 
 
-def _notes(notes: Sequence[str]) -> str:
-    """Return what the planner has to say, set apart so that nobody misses it."""
-    if not notes:
+def _watch(planned: Planned, request: PlanRequest) -> str:
+    """Return what the plan misses and what the planner has to say, set apart so that nobody overlooks it."""
+    rows = tables.key_table(planned, request).rows
+    items = [
+        ("limits", "Missed", f"{name}: {value}, asked for: {asked}.")
+        for name, value, asked, met in rows
+        if met == tables.MISSED
+    ]
+    items += [("watch", "Note", _sentence(note)) for note in planned.plan.notes]
+    if not items:
         return ""
-    rows = "\n".join(
-        f"<li><span class='weight watch'>Note</span><span>{escape(_sentence(note))}</span></li>" for note in notes
+    shown = "\n".join(
+        f"<li><span class='weight {kind}'>{word}</span><span>{escape(text)}</span></li>" for kind, word, text in items
     )
-    return f'<section class="verdict"><h2>What to watch</h2><ul>{rows}</ul></section>'
+    return f'<section class="verdict"><h2>What to watch</h2><ul>{shown}</ul></section>'
 
 
 def _sentence(text: str) -> str:

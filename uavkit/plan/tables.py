@@ -18,6 +18,8 @@ from uavkit.plan.planner import Planned
 
 FOLD_ABOVE = 30
 """Tables with more rows than this are folded."""
+VERTICAL_DEG = 1e-6
+"""The ends of a vertical strip lie less than this apart in latitude and longitude: a decimetre."""
 JSON_FORMAT = "uavkit plan summary 1"
 TRIGGERS = {
     Trigger.DISTANCE: "by distance",
@@ -70,54 +72,90 @@ def _percents(shares: Sequence[float]) -> str:
 # key figures
 
 
+MISSED = "missed"
+SHORT_BY = 0.01
+"""A least overlap under the request by more than this is missed."""
+
+
 def key_table(planned: Planned, request: PlanRequest) -> Table:
     """Return what the plan costs and gives, against what was asked."""
-    rows = [*_cost_rows(planned.plan.summary), *_quality_rows(planned.plan.summary, request)]
-    return Table(title="What it costs, and what it gives", header=("", "Planned", "Asked"), rows=tuple(rows))
+    summary = planned.plan.summary
+    rows = [*_cost_rows(summary), *_image_rows(summary, request), *_limit_rows(summary, request)]
+    header = ("", "Planned", "Asked", "Met")
+    return Table(title="What it costs, and what it gives", header=header, rows=tuple(rows))
 
 
-def _cost_rows(summary: PlanSummary) -> list[tuple[str, str, str]]:
-    return [
-        ("Area", area_text(summary.area_m2), ""),
-        ("Images", str(summary.images), ""),
-        ("Strips", str(summary.strips), ""),
-        ("Sorties", str(summary.sorties), ""),
-        ("Length flown", length_text(summary.length_m), ""),
-        ("Time of flight", duration_text(summary.duration_s), ""),
-    ]
+Row = tuple[str, str, str, str]
 
 
-def _quality_rows(summary: PlanSummary, request: PlanRequest) -> list[tuple[str, str, str]]:
-    imaging, flight = request.imaging, request.flight
+def _cost_rows(summary: PlanSummary) -> list[Row]:
+    rows = (
+        ("Area", area_text(summary.area_m2)),
+        ("Images", str(summary.images)),
+        ("Strips", str(summary.strips)),
+        ("Sorties", str(summary.sorties)),
+        ("Length flown", length_text(summary.length_m)),
+        ("Time of flight", duration_text(summary.duration_s)),
+    )
+    return [(name, value, "", "") for name, value in rows]
+
+
+def _image_rows(summary: PlanSummary, request: PlanRequest) -> list[Row]:
+    imaging = request.imaging
     gsd = f"{imaging.gsd_mm:g}" if imaging.gsd_mm is not None else ""
     height = f"{imaging.height_above_ground_m:g}" if imaging.height_above_ground_m is not None else ""
-    side = f"{100 * imaging.side_overlap:g}" if math.isfinite(summary.side_overlap[0]) else ""
-    if request.pattern == "facade":
-        height = f"{height} from the facade" if height else ""
-    rows = [
-        ("GSD, least / mean / greatest [mm]", _millimetres(summary.gsd_m), gsd),
-        ("Forward overlap, least / mean [%]", _percents(summary.forward_overlap), f"{100 * imaging.forward_overlap:g}"),
-        ("Side overlap, least / mean [%]", _percents(summary.side_overlap), side),
-        (
-            "Height above ground, least / mean / greatest [m]",
-            " / ".join(number(value, 1) for value in summary.height_above_ground_m),
-            height,
-        ),
-        (
-            "Least clearance of the path [m]",
-            number(summary.least_clearance_m, 1),
-            f"{request.terrain.least_clearance_m:g} or more",
-        ),
-        ("Fewest images of a place of the area", str(summary.least_images), f"{imaging.least_images} or more"),
-        (f"Area seen by {imaging.least_images} images or more", percent(summary.covered_enough), "100 %"),
-        ("Area seen by one image or more", percent(summary.covered), "100 %"),
+    if request.pattern == "facade" and height:
+        height += " from the facade"
+    heights = " / ".join(number(value, 1) for value in summary.height_above_ground_m)
+    return [
+        ("GSD, least / mean / greatest [mm]", _millimetres(summary.gsd_m), gsd, ""),
+        _overlap_row("Forward", summary.forward_overlap, imaging.forward_overlap),
+        _overlap_row("Side", summary.side_overlap, imaging.side_overlap),
+        ("Height above ground, least / mean / greatest [m]", heights, height, ""),
     ]
-    if math.isfinite(summary.motion_blur_px):
-        rows.append(("Motion blur [px]", number(summary.motion_blur_px, 2), f"{flight.most_motion_blur_px:g} or less"))
-    if math.isfinite(summary.video_motion_px):
-        most = f"{flight.most_video_motion_px:g} or less"
-        rows.append(("Motion between video frames [px]", number(summary.video_motion_px, 1), most))
+
+
+def _overlap_row(name: str, shares: tuple[float, float], asked: float) -> Row:
+    known = math.isfinite(shares[0])
+    wanted = f"{100.0 * asked:g}" if known else ""
+    return f"{name} overlap, least / mean [%]", _percents(shares), wanted, _met(shares[0] - asked + SHORT_BY)
+
+
+def _limit_rows(summary: PlanSummary, request: PlanRequest) -> list[Row]:
+    imaging, flight, clearance = request.imaging, request.flight, request.terrain.least_clearance_m
+    images = imaging.least_images
+    rows = [
+        (
+            "Least clearance of the path [m]", number(summary.least_clearance_m, 1), f"{clearance:g} or more",
+            _met(summary.least_clearance_m - clearance + 1e-6),
+        ),
+        (
+            "Fewest images of a place of the area", str(summary.least_images), f"{images} or more",
+            _met(summary.least_images - images),
+        ),
+        (
+            f"Area seen by {images} images or more", percent(summary.covered_enough), "100 %",
+            _met(summary.covered_enough - 1.0),
+        ),
+        ("Area seen by one image or more", percent(summary.covered), "100 %", _met(summary.covered - 1.0)),
+    ]  # fmt: skip
+    motions = (
+        ("Motion blur [px]", summary.motion_blur_px, flight.most_motion_blur_px, 2),
+        ("Motion between video frames [px]", summary.video_motion_px, flight.most_video_motion_px, 1),
+    )
+    rows += [
+        (name, number(value, decimals), f"{most:g} or less", _met(most - value + 1e-6))
+        for name, value, most, decimals in motions
+        if math.isfinite(value)
+    ]
     return rows
+
+
+def _met(spare: float) -> str:
+    """Return whether a figure with so much to spare meets the request; empty where there is no figure."""
+    if not math.isfinite(spare):
+        return ""
+    return "yes" if spare >= 0.0 else MISSED
 
 
 def summary_lines(planned: Planned, request: PlanRequest) -> list[str]:
@@ -126,9 +164,10 @@ def summary_lines(planned: Planned, request: PlanRequest) -> list[str]:
     names = max(len(row[0]) for row in rows)
     values = max(len(row[1]) for row in rows)
     lines = [planned.plan.name]
-    lines += [
-        f"  {name:<{names}}  {value:>{values}}{f'   (asked: {asked})' if asked else ''}" for name, value, asked in rows
-    ]
+    for name, value, asked, met in rows:
+        line = f"  {name:<{names}}  {value:>{values}}"
+        line += f"   (asked: {asked}{', ' + met if met == MISSED else ''})" if asked else ""
+        lines.append(line)
     return [*lines, *(f"  note: {note}" for note in planned.plan.notes)]
 
 
@@ -173,13 +212,26 @@ def strips_table(plan: FlightPlan) -> Table:
         above = exposures.height_above_ground_m[own]
         rows.append(
             (
-                str(at + 1), strip.area, number(strip.direction_deg, 1), number(strip.base_m, 2), str(strip.exposures),
+                str(at + 1), strip.area, _direction(plan, at), number(strip.base_m, 2), str(strip.exposures),
                 number(strip.base_m * (strip.exposures - 1), 0), str(int(exposures.sortie[strip.first_exposure]) + 1),
                 f"{above.min():.1f} to {above.max():.1f}", _least_percent(exposures.forward_overlap[own]),
                 _least_percent(exposures.side_overlap[own]), number(1e3 * float(exposures.gsd_m[own, 1].mean()), 1),
             )
         )  # fmt: skip
     return Table(title="Strips", header=header, rows=tuple(rows), folded=len(rows) > FOLD_ABOVE)
+
+
+def _direction(plan: FlightPlan, strip: int) -> str:
+    """Return the direction of a strip; of a vertical one whether it goes up or down."""
+    own = plan.strips[strip]
+    first, last = own.first_exposure, own.first_exposure + own.exposures - 1
+    exposures = plan.exposures
+    north = exposures.latitude_deg[last] - exposures.latitude_deg[first]
+    east = exposures.longitude_deg[last] - exposures.longitude_deg[first]
+    up = float(exposures.height_ellipsoid_m[last] - exposures.height_ellipsoid_m[first])
+    if abs(up) > 0.5 and max(abs(north), abs(east)) < VERTICAL_DEG:
+        return "up" if up > 0.0 else "down"
+    return number(own.direction_deg, 1)
 
 
 def _least_percent(shares: "np.ndarray[Any, np.dtype[np.float64]]") -> str:
