@@ -574,7 +574,8 @@ def heading_faults(plan: FlightPlan) -> list[str]:
 def unlisted_neighbours(plan: FlightPlan) -> list[tuple[int, int]]:
     """Return pairs of strips of one set that lie side by side, with none between, and do not name each other.
 
-    Side by side: more than half of the shorter lies beside the other, along their direction.
+    Side by side: more than half of the shorter lies beside the other, along their direction, not much farther away than
+    lines of the set usually are: farther ones lie on both sides of a gap in the area.
     """
     table = plan.exposures
     spans = []
@@ -596,6 +597,11 @@ def unlisted_neighbours(plan: FlightPlan) -> list[tuple[int, int]]:
         (a0, a1, _), (b0, b1, _) = spans[a], spans[b]
         return min(a1, b1) - max(a0, b0) > 0.5 * min(a1 - a0, b1 - b0) and min(a1 - a0, b1 - b0) > 0.0
 
+    usual_m = {}
+    for key in {(strip.area, strip.set_number) for strip in plan.strips}:
+        lines = sorted(spans[k][2] for k, strip in enumerate(plan.strips) if (strip.area, strip.set_number) == key)
+        apart = [gap for gap in np.diff(lines) if gap > 0.1]
+        usual_m[key] = float(np.median(apart)) if apart else 0.0
     missing = []
     for a, one in enumerate(plan.strips):
         for b in range(a + 1, len(plan.strips)):
@@ -608,7 +614,7 @@ def unlisted_neighbours(plan: FlightPlan) -> list[tuple[int, int]]:
                 for c, third in enumerate(plan.strips)
                 if (third.area, third.set_number) == (one.area, one.set_number)
             )
-            if high - low > 0.01 and not between:
+            if 0.01 < high - low < 1.6 * usual_m[one.area, one.set_number] and not between:
                 missing.append((a, b))
     return missing
 

@@ -2,17 +2,20 @@
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from independent import Judgement, broken_promises, judge
+from independent import Ground, Judgement, PlaneArea, broken_promises, judge, path_legs
 from made_ground import hilly_ground, simple_polygon
 
 from uavkit.core.errors import InputError
 from uavkit.core.flightplan import AreaKind, SurveyArea
 from uavkit.core.frames import LocalMap
 from uavkit.core.surface import ElevationGrid
+from uavkit.core.vehicle import VehicleKind, VehicleProfile
 from uavkit.formats.camera_profiles import load_camera
 from uavkit.formats.plan_request import (
     FlightRequest,
@@ -219,3 +222,79 @@ def test_many_plans_over_flat_ground(case: Case) -> None:
 @LARGE
 def test_many_plans_over_hills(case: Case) -> None:
     check(case, 120)
+
+
+def short_of_breath() -> VehicleProfile:
+    """A multirotor whose battery is soon empty."""
+    return VehicleProfile(
+        name="short of breath",
+        maker="none",
+        kind=VehicleKind.MULTIROTOR,
+        endurance_s=300.0,
+        payload_g=900.0,
+        speed_m_s=5.0,
+        greatest_speed_m_s=12.0,
+        climb_m_s=2.5,
+        descent_m_s=2.0,
+        acceleration_m_s2=2.0,
+        turn_radius_m=0.0,
+        greatest_wind_m_s=None,
+        most_mission_items=100000,
+        autopilot="ardupilot",
+        source="made",
+    )
+
+
+@pytest.mark.parametrize(
+    "trigger",
+    [
+        "hover",
+        pytest.param(
+            "distance",
+            marks=pytest.mark.xfail(strict=True, reason="a strip that is cut ends at its last exposure, without EXIT"),
+        ),
+    ],
+)
+def test_a_flight_divided_into_sorties_keeps_its_promises(trigger: str) -> None:
+    case = Case(
+        shape=2,
+        vertices=5,
+        size_m=400.0,
+        hills=3,
+        follow=True,
+        height_m=50.0,
+        steepest_deg=15.0,
+        trigger=trigger,
+        most_images=250,
+    )
+    asked = case.request()
+    request = asked.model_copy(
+        update={"flight": asked.flight.model_copy(update={"climb_m_s": None, "descent_m_s": None})}
+    )
+    vehicle = short_of_breath()
+    plan = planner.plan_survey(request, (case.area(),), load_camera(case.camera), case.ground(), vehicle).plan
+    assert len(plan.sorties) > 2
+    for sortie in plan.sorties:
+        legs = path_legs(sortie, Ground(elevation=None, level_m=0.0), 1e9)
+        least_s = sum(leg.length_m / leg.end.speed_m_s + leg.end.hold_s for leg in legs)
+        assert least_s <= sortie.duration_s <= vehicle.endurance_s * (1.0 - request.sorties.reserve) + 0.1
+    for before, after in pairwise(range(len(plan.sorties))):
+        stations = [set(plan.exposures.station[plan.exposures.sortie == number].tolist()) for number in (before, after)]
+        assert len(stations[0] & stations[1]) == request.sorties.overlap_images
+    broken = broken_promises(judge(plan, request, load_camera(case.camera), case.ground(), 20), request, vehicle)
+    assert not broken
+
+
+def test_the_path_stays_in_the_fence() -> None:
+    """The fence is a little larger than the area, and convex: where all waypoints lie inside, the legs do."""
+    case = Case(shape=4, vertices=4, size_m=150.0, height_m=50.0)
+    place, area = case.place(), case.area()
+    outline = place.map_from_geographic(*area.latitude_longitude_deg.T)
+    low, high = outline.min(axis=0) - 60.0, outline.max(axis=0) + 60.0
+    corners = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
+    fence = SurveyArea(name="fence", kind=AreaKind.POLYGON, latitude_longitude_deg=place.geographic_from_map(corners))
+    fences = planner.Fences(inside=(fence,))
+    plan = planner.plan_survey(case.request(), (area,), load_camera(case.camera), fences=fences).plan
+    inside = PlaneArea(fence, Ground(elevation=None, level_m=0.0))
+    for waypoint in plan.sorties[0].waypoints:
+        assert inside.contains(np.array([waypoint.latitude_deg]), np.array([waypoint.longitude_deg])).all()
