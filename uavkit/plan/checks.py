@@ -141,7 +141,7 @@ def _limit(asked: float | None, usual: float, vehicle: VehicleProfile | None, na
 
 def check_payload(camera: CameraProfile, vehicle: VehicleProfile | None) -> str:
     """Refuse a camera that is too heavy for the vehicle; return a note where the mass is not known."""
-    if vehicle is None:
+    if vehicle is None or vehicle.payload_g == 0.0:  # its own camera is built in
         return ""
     if camera.mass_g is None:
         return f"the mass of {camera.name} is not known: {vehicle.name} carries {vehicle.payload_g:g} g"

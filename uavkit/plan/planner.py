@@ -275,19 +275,19 @@ def _laid_well(site: _Site, workers: int) -> _Laid:
     """Lay out the survey, and again with a little more where the ground asks for it."""
     ask = _strip_request(site.request)
     asked = site.request.imaging
-    best: _Laid | None = None
-    for attempt in range(ATTEMPTS):
+    holding: _Laid | None = None
+    for _ in range(ATTEMPTS):
         laid = _laid(site, ask, workers)
         _, covered, enough = _coverage(site, laid)
-        short_forward = asked.forward_overlap - _least([m.forward[:-1] for m in laid.measures])
-        short_side = asked.side_overlap - _least([m.side for m in laid.measures])
-        best = laid
+        short_forward, short_side = _shortfall(site, laid)
         if not asked.keep_overlap or site.request.pattern in ("facade", "orbit"):
-            break
-        if covered >= 1.0 and enough >= 1.0 and max(short_forward, short_side) <= MISSED:
-            break
-        if attempt > 0 and covered >= 1.0 and max(short_forward, short_side) <= MISSED:
-            break  # more images than the overlap itself gives cannot be had at the rim
+            return laid
+        if covered >= 1.0 and max(short_forward, short_side) <= MISSED:
+            if enough >= 1.0:
+                return laid
+            if holding is not None:
+                return holding  # more images at the rim did not help: the overlap itself gives no more
+            holding = laid
         ask = replace(
             ask,
             forward_overlap=min(0.98, ask.forward_overlap + (short_forward + 0.002 if short_forward > MISSED else 0.0)),
@@ -295,8 +295,14 @@ def _laid_well(site: _Site, workers: int) -> _Laid:
             extra_stations=ask.extra_stations + (1 if enough < 1.0 else 0),
             inset_share=ask.inset_share + (0.4 if enough < 1.0 else 0.0),
         )
-    assert best is not None
-    return best
+    return holding if holding is not None else laid
+
+
+def _shortfall(site: _Site, laid: _Laid) -> tuple[float, float]:
+    """Return how far the least forward and side overlaps are under the request; negative where they are above."""
+    asked = site.request.imaging
+    forward = asked.forward_overlap - _least([found.forward[:-1] for found in laid.measures])
+    return forward, asked.side_overlap - _least([found.side for found in laid.measures])
 
 
 def _least(values: Sequence[Array]) -> float:
@@ -495,7 +501,7 @@ def _planned(
     least, covered, enough = _coverage(site, laid)
     summary = replace(
         done.summary,
-        area_m2=float(sum(shape.area for shape in site.covered)),
+        area_m2=_covered_m2(site, laid),
         least_images=least,
         covered=covered,
         covered_enough=enough,
@@ -520,9 +526,15 @@ def _planned(
         summary=summary,
         terrain=site.ground.source,
         images_in_turns=request.flight.images_in_turns,
-        notes=tuple([*notes, *done.notes, *_notes(request, summary, site)]),
+        notes=tuple([*notes, *done.notes, *_short_notes(site, laid), *_notes(request, summary, site)]),
     )
     return Planned(plan=plan, coverage=laid.coverages[0], local_map=local_map, footprints_deg=done.footprints_deg)
+
+
+def _covered_m2(site: _Site, laid: _Laid) -> float:
+    """Return the size of what is to be covered: ground, or the faces themselves."""
+    shapes = [found.area for found in laid.sets] if site.request.pattern == "facade" else site.covered
+    return float(sum(shape.area for shape in shapes))
 
 
 def _longest_mission(plan: FlightPlan, vehicle: VehicleProfile | None) -> int:
@@ -538,6 +550,17 @@ def _too_many_items(plan: FlightPlan, needed: int, most: int) -> InputError:
         f"the mission has {needed} items, the autopilot holds {most}: divide it ([sorties] split_at_items = true, or "
         f"--split), {other}, or plan a smaller area"
     )
+
+
+def _short_notes(site: _Site, laid: _Laid) -> list[str]:
+    """Say where the overlap stays under the request."""
+    short = zip(("forward", "side"), _shortfall(site, laid), strict=True)
+    change = "bring strips closer (--keep-overlap)" if not site.request.imaging.keep_overlap else "fly higher or slower"
+    return [
+        f"the {which} overlap is up to {missing:.1%} of the image under the request in places: {change}"
+        for which, missing in short
+        if missing > 0.01
+    ]
 
 
 def _notes(request: PlanRequest, summary: Any, site: _Site) -> list[str]:
