@@ -134,6 +134,8 @@ def _plan_caption(scene: Scene, drawn: dict[str, bool]) -> str:
         parts.append("Contours in metres above the take-off point.")
     if scene.request.pattern == "corridor":
         parts.append("Dotted: the band to be covered.")
+    if scene.looks_sideways:
+        parts.append("Short orange lines: where the cameras look.")
     if scene.is_facade:
         parts.append("The strips before the facade are vertical: from above each is a point.")
     if len(plan.sorties) > len(SORTIE_COLOURS):

@@ -76,7 +76,7 @@ def _headline(planned: Planned, request: PlanRequest, elevation: ElevationGrid |
         ("Images", str(summary.images), f"in {summary.strips} strip{_s(summary.strips)}"),
         ("Flight", tables.duration_text(summary.duration_s), _flight_text(planned)),
         ("Area", tables.area_text(summary.area_m2), _coverage_text(planned, request)),
-        ("Pixel on the ground", f"{1e3 * summary.gsd_m[1]:.1f} mm", "mean ground sampling distance"),
+        ("Ground sampling distance", f"{1e3 * summary.gsd_m[1]:.1f} mm", "mean of all images"),
         ("Least overlap", _overlap_text(planned), "forward, side"),
         ("Least clearance", f"{number(summary.least_clearance_m, 1)} m", _clearance_text(elevation)),
     ]
