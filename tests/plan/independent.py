@@ -600,7 +600,7 @@ def unlisted_neighbours(plan: FlightPlan) -> list[tuple[int, int]]:
     usual_m = {}
     for key in {(strip.area, strip.set_number) for strip in plan.strips}:
         lines = sorted(spans[k][2] for k, strip in enumerate(plan.strips) if (strip.area, strip.set_number) == key)
-        apart = [gap for gap in np.diff(lines) if gap > 0.1]
+        apart = [gap for gap in np.diff(lines) if gap > 0.5]  # parts of one line differ a little by its curvature
         usual_m[key] = float(np.median(apart)) if apart else 0.0
     missing = []
     for a, one in enumerate(plan.strips):
@@ -609,12 +609,13 @@ def unlisted_neighbours(plan: FlightPlan) -> list[tuple[int, int]]:
             if (one.area, one.set_number) != (other.area, other.set_number) or b in one.neighbours or not beside(a, b):
                 continue
             low, high = sorted((spans[a][2], spans[b][2]))
+            usual = usual_m[one.area, one.set_number]
             between = any(
-                low + 0.01 < spans[c][2] < high - 0.01 and beside(a, c) and beside(b, c)
+                low + 0.2 * usual < spans[c][2] < high - 0.2 * usual and beside(a, c) and beside(b, c)
                 for c, third in enumerate(plan.strips)
                 if (third.area, third.set_number) == (one.area, one.set_number)
             )
-            if 0.01 < high - low < 1.6 * usual_m[one.area, one.set_number] and not between:
+            if 0.3 * usual < high - low < 1.6 * usual and not between:
                 missing.append((a, b))
     return missing
 
