@@ -1,9 +1,12 @@
 """Patterns other than a polygon's strips, and what the planner refuses."""
 
+from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 
 from tests.plan.made_requests import CAMERA, MAP, SQUARE, area, hills, request, vehicle
 from uavkit.core.errors import InputError
@@ -83,6 +86,31 @@ def test_facades_of_a_house_look_at_it_from_outside() -> None:
         assert np.all(np.einsum("ij,ij->i", looks[:, :2], towards) > 0.0)
 
 
+def test_way_home_from_a_facade_passes_over_it() -> None:
+    """Of a face with a bend inwards the chord from one end to the other goes through the rock: only above its top."""
+    bent = [(0.0, 0.0), (60.0, 0.0), (110.0, 40.0)]
+    asked = request(
+        pattern="facade",
+        facade={"height_m": 25.0},
+        imaging={"height_above_ground_m": 12.0},
+        terrain={"least_clearance_m": 3.0},
+        flight={"trigger": "hover"},
+        sorties={"split_at_items": True, "most_items": 200},
+    )
+    plan = plan_survey(asked, (area(bent, AreaKind.LINE),), CAMERA).plan
+    assert len(plan.sorties) > 1
+    face = shapely.LineString(bent).buffer(2.0)
+    for sortie in plan.sorties:
+        places = MAP.map_from_geographic(
+            np.array([point.latitude_deg for point in sortie.waypoints]),
+            np.array([point.longitude_deg for point in sortie.waypoints]),
+        )
+        heights = [point.height_above_takeoff_m for point in sortie.waypoints]
+        for begin, end, z in zip(places, places[1:], pairwise([*heights]), strict=False):
+            if np.hypot(*(end - begin)) > 0.1 and face.intersects(shapely.LineString([begin, end])):
+                assert min(z) >= 28.0 - 1e-6
+
+
 def test_orbit_looks_at_the_object_from_all_around() -> None:
     asked = request(
         pattern="orbit",
@@ -111,8 +139,6 @@ def with_void() -> ElevationGrid:
     grid = hills()
     heights = grid.height_ellipsoid_m.copy()
     heights[95:100, 105:112] = np.nan
-    from dataclasses import replace
-
     return replace(grid, height_ellipsoid_m=heights)
 
 
@@ -144,8 +170,6 @@ def with_void() -> ElevationGrid:
 def test_what_cannot_be_flown_is_refused_with_what_to_change(
     tables: dict[str, Any], extra: dict[str, Any], words: str
 ) -> None:
-    from dataclasses import replace
-
     elevation = extra.get("elevation", hills() if "terrain" in tables else None)
     camera = replace(CAMERA, mass_g=240.0)
     with pytest.raises(InputError, match=words):

@@ -111,15 +111,29 @@ class Airfield:
     rules: tuple[HeightRule, ...]
     """Of each set."""
     clearance_m: float
+    tops_m: tuple[float, ...] = ()
+    """Of each set: the height above which nothing stands that the terrain model does not show, like a facade."""
 
     def between(self, ends: tuple[Array, Array], set_number: int) -> Array:
         """Return a path from one place to another, by the rule of a set."""
         return transit_path(self.ground, self.rules[set_number], self.clearance_m, ends)
 
+    def over(self, ends: tuple[Array, Array], set_number: int) -> Array:
+        """Return a path from one place to another that also passes over what stands there."""
+        path = self.between(ends, set_number)
+        top = self.tops_m[set_number] if self.tops_m else -np.inf
+        lifted = path.copy()
+        lifted[1:-1, 2] = np.maximum(path[1:-1, 2], top)
+        if top > ends[1][2] and len(path) > 1:
+            lifted = np.concatenate([lifted[:-1], [[*ends[1][:2], top]], lifted[-1:]])
+        if top > ends[0][2] and (len(path) < 3 or not np.array_equal(path[1, :2], ends[0][:2])):
+            lifted = np.concatenate([lifted[:1], [[*ends[0][:2], top]], lifted[1:]])
+        return np.asarray(lifted[np.concatenate([[True], np.linalg.norm(np.diff(lifted, axis=0), axis=1) > 0.0])])
+
 
 def home_legs(field: Airfield, place: Array, set_number: int) -> Array:
     """Return the path (k, 3) from the take-off point on the ground to a place."""
-    return field.between((field.home_m, place), set_number)
+    return field.over((field.home_m, place), set_number)
 
 
 def cumulative_times(lines: Sequence[tuple[int, StationLine]], times: Sequence[LineTimes], flies: Performance) -> Array:
@@ -241,7 +255,8 @@ def sortie_vertices(
     vertices += _bare(way[1:-1], roles, flies)
     for number, (member, line) in enumerate(parts):
         if number:
-            path = field.between((parts[number - 1][1].path_m[-1], line.path_m[0]), member)
+            ends, elsewhere = (parts[number - 1][1].path_m[-1], line.path_m[0]), parts[number - 1][1].area != line.area
+            path = field.over(ends, member) if elsewhere else field.between(ends, member)
             vertices += _bare(path[1:-1], [WaypointRole.TURN] * len(path), flies)
         vertices += _line_vertices(line, first_line + number, flies)
     back = home_legs(field, parts[-1][1].path_m[-1], parts[-1][0])[::-1]

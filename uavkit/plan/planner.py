@@ -461,6 +461,8 @@ def _airfield(site: _Site, laid: _Laid) -> Airfield:
     member, first = laid.flown[0]
     start = (first.path_m[0] @ laid.sets[member].axes.T + laid.sets[member].origin_m)[:2]
     home_xy = site.home_xy
+    if home_xy is None and site.request.pattern in ("facade", "orbit"):
+        home_xy = start
     if home_xy is None:
         from shapely.ops import nearest_points
 
@@ -478,7 +480,18 @@ def _airfield(site: _Site, laid: _Laid) -> Airfield:
         ground=site.ground,
         rules=tuple(rules),
         clearance_m=site.request.terrain.least_clearance_m + 2.0 * site.ground.sigma_m,
+        tops_m=tuple(_top(site, laid_set) for laid_set in laid.sets),
     )
+
+
+def _top(site: _Site, laid: LaidSet) -> float:
+    """Return the height at which a vehicle passes over what a set surveys, -inf where that is the ground itself."""
+    request, clear = site.request, site.request.terrain.least_clearance_m
+    if request.facade is not None and request.pattern == "facade":
+        return float(laid.origin_m[2]) + request.facade.height_m + clear
+    if request.orbit is not None and laid.target_m is not None:
+        return float(laid.target_m[2]) + 0.5 * request.orbit.object_height_m + clear
+    return float("-inf")
 
 
 def _map_fences(site: _Site, fences: Fences, vehicle: VehicleProfile | None) -> checks.MapFences:
@@ -567,9 +580,11 @@ def _notes(request: PlanRequest, summary: Any, site: _Site) -> list[str]:
     notes = []
     asked = request.imaging
     if summary.covered_enough < 1.0:
+        low = request.pattern == "facade"
+        change = "the vehicle keeps its clearance from the ground there" if low else "more overlap would change that"
         notes.append(
             f"{1.0 - summary.covered_enough:.1%} of the area are seen by fewer than {asked.least_images} images "
-            f"(least: {summary.least_images}): more overlap would change that"
+            f"(least: {summary.least_images}): {change}"
         )
     if site.ground.is_flat and request.pattern not in ("facade",):
         notes.append("no terrain model was given: the ground is taken as level with the take-off point")
