@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from independent import Ground, Judgement, PlaneArea, broken_promises, judge, path_legs
+from independent import Ground, Images, Judgement, PlaneArea, broken_promises, geocentric, judge, path_legs
 from made_ground import hilly_ground, simple_polygon
 
 from uavkit.core.errors import InputError
@@ -222,6 +222,26 @@ def test_many_plans_over_flat_ground(case: Case) -> None:
 @LARGE
 def test_many_plans_over_hills(case: Case) -> None:
     check(case, 120)
+
+
+@pytest.mark.parametrize("follow", [False, True], ids=["constant", "followed"])
+def test_the_coverage_map_counts_images(follow: bool) -> None:
+    """At the middles of some of its cells: in as many images as found here, but for points on the very rim of one."""
+    case = Case(shape=7, kind="untangled", vertices=8, hole=True, hills=5, steepest_deg=30.0, follow=follow)
+    camera, elevation = load_camera(case.camera), case.ground()
+    planned = planner.plan_survey(case.request(), (case.area(),), camera, elevation)
+    coverage = planned.coverage
+    rows, columns = (index[:: max(1, len(index) // 1000)] for index in np.nonzero(coverage.in_area))
+    xy_m = np.column_stack([columns, rows]) * coverage.cell_m + np.array(coverage.first_xy_m)
+    latitude, longitude = planned.local_map.geographic_from_map(xy_m).T
+    ground = Ground(elevation=elevation, level_m=np.nan)
+    images = Images(planned.plan, camera, ground)
+    lying, _ = images.seen_by(geocentric(latitude, longitude, ground.heights_m(latitude, longitude)))
+    differences = np.abs(coverage.images[rows, columns].astype(int) - lying)
+    assert differences.max() <= 1
+    assert np.mean(differences > 0) < 0.02
+    assert PlaneArea(case.area(), ground).contains(latitude, longitude).mean() > 0.99
+    assert planned.plan.summary.least_images <= lying.min()
 
 
 def short_of_breath() -> VehicleProfile:
