@@ -59,20 +59,50 @@ def ground_heights(heights: Heights, polynomial: Floats, origin: Floats, xy: Flo
 
 
 @inlined
+def _reach_on_gentle_ground(
+    heights: Heights, polynomial: Floats, origin: Floats, centre: Floats, ray: tuple[float, float, float], guess: float
+) -> float:
+    """Return how far along a ray the ground is met, by secants from a guess of its height; -1 if they do not settle.
+
+    Only where a single crossing is possible.
+    """
+    dx, dy, dz = ray
+    near_enough = max(1e-3, 2e-5 * (centre[2] - guess))
+    t = max((centre[2] - guess) / -dz, 0.0)
+    gap = centre[2] + t * dz - ground_height(heights, polynomial, origin, centre[0] + t * dx, centre[1] + t * dy)
+    after = t + gap / -dz
+    for _ in range(8):
+        if np.isnan(gap):
+            return np.nan
+        if abs(gap) < near_enough:
+            return float(t)
+        new = (
+            centre[2]
+            + after * dz
+            - ground_height(heights, polynomial, origin, centre[0] + after * dx, centre[1] + after * dy)
+        )
+        if new == gap:
+            break
+        t, gap, after = after, new, after + new * (after - t) / (gap - new)
+        if after < 0.0:
+            break
+    return float(t) if abs(gap) < near_enough else -1.0
+
+
+@kernel
 def _reach(
     heights: Heights,
     polynomial: Floats,
     origin: Floats,
     limits: Floats,
     centre: Floats,
-    dx: float,
-    dy: float,
-    dz: float,
+    ray: tuple[float, float, float],
 ) -> float:
     """Return how far along a ray (dx, dy, dz), dz < 0, the ground is met; nan if it is not met, or over a void.
 
     limits: least and greatest height of the ground, greatest slope, step of the march, greatest horizontal distance.
     """
+    dx, dy, dz = ray
     low, high, slope, step, farthest = limits[0], limits[1], limits[2], limits[3], limits[4]
     run = np.sqrt(dx * dx + dy * dy)
     if dz > -1e-3 * run:
@@ -89,12 +119,10 @@ def _reach(
                 break
             t += stride
         near, far = max(near, t - stride), t
-    above = (
-        centre[2] + near * dz - ground_height(heights, polynomial, origin, centre[0] + near * dx, centre[1] + near * dy)
-    )
-    below = (
-        centre[2] + far * dz - ground_height(heights, polynomial, origin, centre[0] + far * dx, centre[1] + far * dy)
-    )
+    above = centre[2] + near * dz
+    above -= ground_height(heights, polynomial, origin, centre[0] + near * dx, centre[1] + near * dy)
+    below = centre[2] + far * dz
+    below -= ground_height(heights, polynomial, origin, centre[0] + far * dx, centre[1] + far * dy)
     if np.isnan(above) or np.isnan(below):
         return np.nan
     if above <= 0.0:
@@ -130,15 +158,22 @@ def ground_points(
     """Ground points (n, m, 3) of directions (m, 3) in image space of images at centres (n, 3), rotations (n, 3, 3)."""
     for i in range(len(centres)):
         centre = centres[i]
+        guess = ground_height(heights, polynomial, origin, centre[0], centre[1])
         for k in range(len(directions)):
             u, v, w = directions[k, 0], directions[k, 1], directions[k, 2]
             dx = rotations[i, 0, 0] * u + rotations[i, 0, 1] * v + rotations[i, 0, 2] * w
             dy = rotations[i, 1, 0] * u + rotations[i, 1, 1] * v + rotations[i, 1, 2] * w
             dz = rotations[i, 2, 0] * u + rotations[i, 2, 1] * v + rotations[i, 2, 2] * w
-            t = _reach(heights, polynomial, origin, limits, centre, dx, dy, dz)
+            t = -1.0
+            if limits[2] * np.sqrt(dx * dx + dy * dy) < -0.95 * dz and guess < centre[2]:
+                t = _reach_on_gentle_ground(heights, polynomial, origin, centre, (dx, dy, dz), guess)
+            if t == -1.0:
+                t = _reach(heights, polynomial, origin, limits, centre, (dx, dy, dz))
             out[i, k, 0] = centre[0] + t * dx
             out[i, k, 1] = centre[1] + t * dy
             out[i, k, 2] = centre[2] + t * dz
+            if not np.isnan(t):
+                guess = out[i, k, 2]
 
 
 @inlined

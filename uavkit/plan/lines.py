@@ -74,21 +74,28 @@ class StationLine:
         return len(self.centres_m)
 
     def part(self, first: int, last: int) -> "StationLine":
-        """Return the line with the stations first to last only; where it is cut there is no lead."""
-        begin = 0 if first == 0 else int(self.station_vertex[first])
-        whole = last == len(self) - 1
-        end = len(self.path_m) if whole else int(self.station_vertex[last]) + 1
-        bends = self.bends[begin:end].copy()
+        """Return the line with the stations first to last only; where it is cut it gets a lead and an exit."""
+        reached = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.path_m, axis=0), axis=1))])
+        stations = reached[self.station_vertex]
+        beyond = float(reached[self.exit_vertex] - stations[-1])  # 0 where the vehicle stops at every station
+        begin = 0.0 if first == 0 else max(0.0, stations[first] - stations[0])
+        leaves = float(reached[self.exit_vertex]) if last == len(self) - 1 else float(stations[last]) + beyond
+        end = float(reached[-1]) if last == len(self) - 1 else leaves
+        every = np.unique(np.concatenate([reached[(reached >= begin) & (reached <= end)], [begin, leaves, end]]))
+        path = np.column_stack([np.interp(every, reached, self.path_m[:, axis]) for axis in range(3)])
+        bends = np.isin(every, reached[self.bends])
         bends[[0, -1]] = True
+        vertices = np.searchsorted(every, stations[first : last + 1])
+        bends[vertices[[0, -1]]] = True
         return replace(
             self,
             centres_m=self.centres_m[first : last + 1],
             rotations=self.rotations[first : last + 1],
             in_area=self.in_area[first : last + 1],
-            path_m=self.path_m[begin:end],
+            path_m=path,
             bends=bends,
-            station_vertex=self.station_vertex[first : last + 1] - begin,
-            exit_vertex=(self.exit_vertex if whole else int(self.station_vertex[last])) - begin,
+            station_vertex=vertices.astype(np.int64),
+            exit_vertex=int(np.searchsorted(every, leaves)),
             back_exit_vertex=0,
         )
 

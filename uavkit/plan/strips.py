@@ -96,6 +96,7 @@ class _Layout:
         across = self.bounds[3] - self.bounds[1]
         refuse_too_many(self.polygon.area / (self.base_m * self.distance_m) + across / self.distance_m, strips.area)
         self.last_base_m, self.last_distance_m = self.base_m, np.inf
+        self.base_of_row: dict[float, float] = {}
 
     def map_xy(self, u: float, v: float) -> Array:
         return u * self.strips.along + v * self.strips.across
@@ -153,9 +154,7 @@ class _Layout:
 
     def _probe(self, row: float, intervals: list[Interval]) -> list[tuple[StationLine, Array]]:
         """Return lines of a row with stations and their ground points, for the comparison with another row."""
-        lines = [self._line(row, interval, []) for interval in intervals]
-        imaging, ground = self.strips.mounting.imaging, self.strips.mounting.ground
-        return [(line, points_on_ground(imaging, ground, line, imaging.probe_directions)) for line in lines]
+        return [self._line(row, interval, []) for interval in intervals]
 
     def _least_side(self, here: list[tuple[StationLine, Array]], there: list[tuple[StationLine, Array]]) -> float:
         least = np.nan
@@ -210,26 +209,28 @@ class _Layout:
         for number, row in enumerate(rows):
             around = [interval for other in own[max(0, number - 1) : number + 2] for interval in other]
             for interval in self._merged(around):
-                line = self._line(row, interval, own[number])
+                line, _ = self._line(row, interval, own[number])
                 result.append(replace(line, row=number))
         return result
 
-    def _line(self, row: float, interval: Interval, own: list[Interval]) -> StationLine:
-        """Return a line over an interval of u, its base short enough for the forward overlap on the ground.
+    def _line(self, row: float, interval: Interval, own: list[Interval]) -> tuple[StationLine, Array]:
+        """Return a line over an interval of u, its base short enough for the forward overlap, and its ground points.
 
         Where the vehicle stops for every image the base changes along the line, else the shortest one serves it all.
         """
         ask = self.strips.request
-        along = self._evenly(interval, min(self.base_m, LONGER * self.last_base_m))
+        known = self.base_of_row.get(row, LONGER * self.last_base_m)
+        along = self._evenly(interval, min(self.base_m, known * (1.0 + 1e-9)))
         for turn in range(ROUNDS):
             line = self._stations(row, along, own)
+            points = self._points(line)
             if not ask.keep_overlap or len(line) < 2:
-                return line
-            shares = self._forward(line)
+                return line, points
+            shares = self._forward(line, points)
             least = float(np.min(shares))
-            self.last_base_m = line.base_m
+            self.last_base_m = self.base_of_row[row] = line.base_m
             if least >= ask.forward_overlap + 0.5 * SPARE or self._exact(least, ask.forward_overlap):
-                return line
+                return line, points
             factors = (1.0 - ask.forward_overlap - SPARE) / np.maximum(1.0 - shares, 1e-3)
             if self.strips.mounting.stops:
                 # in the end nothing may grow again, or shares would go to and fro
@@ -238,10 +239,13 @@ class _Layout:
                 along = self._evenly(interval, line.base_m * float(np.clip(factors.min(), 0.3, FIRMLY)))
         raise self._impossible("forward", ask.forward_overlap, row)
 
-    def _forward(self, line: StationLine) -> Array:
+    def _points(self, line: StationLine) -> Array:
+        imaging = self.strips.mounting.imaging
+        return points_on_ground(imaging, self.strips.mounting.ground, line, imaging.probe_directions)
+
+    def _forward(self, line: StationLine, points: Array) -> Array:
         """Return the lesser share (n - 1,) that two neighbours show of one another, whichever is flown first."""
         imaging = self.strips.mounting.imaging
-        points = points_on_ground(imaging, self.strips.mounting.ground, line, imaging.probe_directions)
         ahead = forward_overlaps(imaging, line, points)[:-1]
         back = replace(
             line,
