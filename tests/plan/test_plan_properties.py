@@ -224,6 +224,19 @@ def test_many_plans_over_hills(case: Case) -> None:
     check(case, 120)
 
 
+@pytest.mark.parametrize("shape", [7, 11, 24, 40, 45])
+@pytest.mark.xfail(strict=False, reason="exposures are brought closer from row to row where nothing asks for it")
+def test_flat_ground_takes_no_more_images_than_its_strips_need(shape: int) -> None:
+    """Over flat ground a strip holds its overlap with the base asked for: no need to bring exposures closer."""
+    case = Case(
+        shape=shape, kind="untangled", vertices=9, size_m=400.0, forward=0.7, side=0.6, height_m=40.0, most_images=400
+    )
+    base_m, _ = case.image_m()
+    plan = planner.plan_survey(case.request(), (case.area(),), load_camera(case.camera)).plan
+    needed = [math.ceil((strip.exposures - 1) * strip.base_m / base_m - 1e-6) + 1 for strip in plan.strips]
+    assert sum(strip.exposures for strip in plan.strips) <= 1.02 * sum(needed)
+
+
 @pytest.mark.parametrize("follow", [False, True], ids=["constant", "followed"])
 def test_the_coverage_map_counts_images(follow: bool) -> None:
     """At the middles of some of its cells: in as many images as found here, but for points on the very rim of one."""
