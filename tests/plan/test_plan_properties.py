@@ -278,16 +278,7 @@ def short_of_breath() -> VehicleProfile:
     )
 
 
-@pytest.mark.parametrize(
-    "trigger",
-    [
-        "hover",
-        pytest.param(
-            "distance",
-            marks=pytest.mark.xfail(strict=True, reason="a strip that is cut ends at its last exposure, without EXIT"),
-        ),
-    ],
-)
+@pytest.mark.parametrize("trigger", ["hover", "distance", "time"])
 def test_a_flight_divided_into_sorties_keeps_its_promises(trigger: str) -> None:
     case = Case(
         shape=2,
