@@ -79,10 +79,12 @@ def orient_approximately(
     interior: InteriorOrientation,
     sigmas: InteriorSigmas,
     progress: Progress,
+    first: Flags | None = None,
 ) -> GrowingBlock:
     """Orient as many of the stills as hang together; ``counts`` is the number of stills and of points.
 
-    Raises AdjustmentError where not even two stills can be oriented to each other.
+    The block begins with two of the stills that ``first`` (n,) allows. Raises AdjustmentError where not even two of
+    them can be oriented to each other.
     """
     block = GrowingBlock(
         interior=interior,
@@ -91,7 +93,7 @@ def orient_approximately(
         points=np.full((counts[1], 3), np.nan),
         reasons={},
     )
-    _start_with_pair(block, rays)
+    _start_with_pair(block, rays, np.ones(counts[0], dtype=bool) if first is None else first)
     _intersect(block, rays)
     next_adjustment, failed = 3, dict[int, int]()
     while True:
@@ -149,9 +151,10 @@ def _largest_part(common: Array) -> Array:
     return np.asarray(np.where(largest[:, None] & largest[None, :], common, 0.0))
 
 
-def _start_with_pair(block: GrowingBlock, rays: RayTable) -> None:
+def _start_with_pair(block: GrowingBlock, rays: RayTable, allowed: Flags) -> None:
     """Orient the pair with the most well-intersecting points, out of the twenty richest pairs of the largest part."""
-    common = np.triu(_largest_part(common_points(rays, len(block.centres))))
+    common = common_points(rays, len(block.centres)) * (allowed[:, None] & allowed[None, :])
+    common = np.triu(_largest_part(common))
     richest = np.argsort(-common, axis=None, kind="stable")[:20]
     best: tuple[float, int, int, Array, Array] | None = None
     for flat in richest.tolist():

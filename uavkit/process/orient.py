@@ -17,11 +17,11 @@ from uavkit.core.arrays import Array
 from uavkit.core.block import Block
 from uavkit.core.cache import NoCache, StepCache
 from uavkit.core.devices import StillSource, VideoSource
-from uavkit.core.errors import AdjustmentError, InputError
+from uavkit.core.errors import InputError
 from uavkit.core.progress import Progress, silent
 from uavkit.core.result import OrientedBlock, PointOrigin
 from uavkit.process.absolute import robust_similarity
-from uavkit.process.approximations import GrowingBlock, orient_approximately, ray_table
+from uavkit.process.approximations import GrowingBlock, ray_table
 from uavkit.process.calibration import calibrated
 from uavkit.process.candidates import Candidates, empty, from_measurements, join
 from uavkit.process.features import feature_tasks, match_features, pairs_to_compare
@@ -39,6 +39,7 @@ from uavkit.process.network import (
     without_weak_stills,
 )
 from uavkit.process.options import CandidateSource, ProcessOptions
+from uavkit.process.parts import Pairs, joined_by_features, orient_in_parts
 from uavkit.process.pictures import PictureStore, PyramidStore, return_freed_memory
 from uavkit.process.ray_sigma import SigmaCalibration
 from uavkit.process.summary import Findings, peak_memory_mb, summarise
@@ -135,36 +136,30 @@ def orient_block(
 
 
 def _approximate_block(place: Workplace) -> tuple[Candidates, GrowingBlock]:
-    """Find candidates and orient them; stills that the video could not tie are tried again with features."""
-    candidates, weak = _first_candidates(place)
-    growing = _approximately(place, candidates, last=not weak)
-    source = place.options.candidates.source
-    for ends in (1, 2):  # first pairs between what is oriented and what is not, then pairs of which nothing is
-        loose = set(range(len(place.store)) if growing is None else np.flatnonzero(~growing.oriented).tolist())
-        pairs = [pair for pair in weak if len(loose & set(pair)) == ends]
-        if source is not CandidateSource.AUTO or not pairs:
-            continue
-        place.notes.append(f"the video did not tie {len(loose)} stills: features were tried in {len(pairs)} pairs")
-        candidates = join([candidates, _feature_candidates(place, pairs)])
-        growing = _approximately(place, candidates, last=ends == 2)
-    if growing is None:
-        growing = _approximately(place, candidates, last=True)
-    if growing is None:  # not reached: a last attempt without success raises
-        raise AdjustmentError("the stills could not be oriented approximately")
-    return candidates, growing
+    """Find candidates and orient them; features join what the video leaves in parts."""
+    through, pairs = _first_candidates(place)
+    joined = joined_by_features(
+        through,
+        pairs,
+        place.block.interior,
+        lambda pairs: _feature_candidates(place, pairs),
+        lambda candidates: _in_parts(place, candidates),
+    )
+    place.notes.extend(joined.notes)
+    return joined.candidates, joined.block
 
 
-def _first_candidates(place: Workplace) -> tuple[Candidates, list[tuple[int, int]]]:
-    """Return candidates by the way that the options name, and the pairs that features may be tried on afterwards."""
+def _first_candidates(place: Workplace) -> tuple[Candidates, tuple[Pairs, Pairs]]:
+    """Return candidates through the video; the pairs to try features on at once, and those that may be tried later."""
     source = place.options.candidates.source
     sync = place.block.video
     pairs = pairs_to_compare(len(place.store), _positions(place.block), place.options.candidates.neighbours)
     if place.video is None or sync is None or len(sync.places) < 2:
         if source is CandidateSource.VIDEO:
             raise InputError("candidates.source=video, but the block has no video that is synchronised with its stills")
-        return _feature_candidates(place, pairs), []
+        return empty(), (pairs, [])
     if source is CandidateSource.FEATURES:
-        return _feature_candidates(place, pairs), []
+        return empty(), (pairs, [])
     with place.step("tracking through the video"):
         given = VideoInput(
             video=place.video,
@@ -175,16 +170,14 @@ def _first_candidates(place: Workplace) -> tuple[Candidates, list[tuple[int, int
             measurement=place.options.measurement,
         )
         through = candidates_through_video(given, place.cache, workers=place.workers, progress=place.progress)
-    parts, rest = [through.candidates], pairs
     if source is CandidateSource.BOTH:
-        parts.append(_feature_candidates(place, pairs))
-    elif source is CandidateSource.AUTO:
-        gaps = sorted({*through.weak_pairs, *_unplaced_pairs(place)})
-        if gaps:
-            place.notes.append(f"gaps in the video: {len(gaps)}; features bridge them")
-            parts.append(_feature_candidates(place, gaps))
-            rest = [pair for pair in pairs if pair not in gaps]
-    return join(parts), rest
+        return through.candidates, (pairs, [])
+    if source is CandidateSource.VIDEO:
+        return through.candidates, ([], [])
+    gaps = sorted({*through.weak_pairs, *_unplaced_pairs(place)})
+    if gaps:
+        place.notes.append(f"gaps in the video: {len(gaps)}; features bridge them")
+    return through.candidates, (gaps, [pair for pair in pairs if pair not in gaps])
 
 
 def _unplaced_pairs(place: Workplace) -> set[tuple[int, int]]:
@@ -207,8 +200,10 @@ def _positions(block: Block) -> Array | None:
     return positions
 
 
-def _feature_candidates(place: Workplace, pairs: list[tuple[int, int]]) -> Candidates:
+def _feature_candidates(place: Workplace, pairs: Pairs) -> Candidates:
     """Match features on pairs of stills and measure the points by least squares matching."""
+    if not pairs:
+        return empty()
     options, block = place.options, place.block
     with place.step("features"):
         matches = match_features(
@@ -235,26 +230,22 @@ def _feature_candidates(place: Workplace, pairs: list[tuple[int, int]]) -> Candi
     return from_measurements(tasks, rays, PointOrigin.FEATURES)
 
 
-def _approximately(place: Workplace, candidates: Candidates, *, last: bool) -> GrowingBlock | None:
-    """Orient approximately; without success None, or the error where nothing else can be tried."""
+def _in_parts(place: Workplace, candidates: Candidates) -> list[GrowingBlock]:
+    """Orient approximately, the largest part first."""
     point, image, xy, _ = candidates.all_rays()
     block, marked, m = place.block, marked_points(place.block), len(candidates)
     point, image = np.concatenate([point, m + marked.point]), np.concatenate([image, marked.image])
-    try:
-        with place.step("approximate orientation"):
-            growing = orient_approximately(
-                ray_table(point, image, np.concatenate([xy, marked.xy_px]), block.interior),
-                (len(block.stills), m + len(marked.points)),
-                block.interior,
-                interior_sigmas(block),
-                place.progress,
-            )
-        growing.points = growing.points[:m]
-        return growing
-    except AdjustmentError:
-        if last:
-            raise
-        return None
+    with place.step("approximate orientation"):
+        parts = orient_in_parts(
+            ray_table(point, image, np.concatenate([xy, marked.xy_px]), block.interior),
+            (len(block.stills), m + len(marked.points)),
+            block.interior,
+            interior_sigmas(block),
+            place.progress,
+        )
+    for part in parts:
+        part.points = part.points[:m]
+    return parts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
