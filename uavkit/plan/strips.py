@@ -219,8 +219,8 @@ class _Layout:
         Where the vehicle stops for every image the base changes along the line, else the shortest one serves it all.
         """
         ask = self.strips.request
-        known = self.base_of_row.get(row, LONGER * self.last_base_m)
-        along = self._evenly(interval, min(self.base_m, known * (1.0 + 1e-9)))
+        longest = min(self.base_m, self.base_of_row.get(row, LONGER * self.last_base_m))
+        along = self._evenly(interval, longest)
         for turn in range(ROUNDS):
             line = self._stations(row, along, own)
             points = self._points(line)
@@ -228,7 +228,7 @@ class _Layout:
                 return line, points
             shares = self._forward(line, points)
             least = float(np.min(shares))
-            self.last_base_m = self.base_of_row[row] = line.base_m
+            self.last_base_m = self.base_of_row[row] = longest
             if least >= ask.forward_overlap + 0.5 * SPARE or self._exact(least, ask.forward_overlap):
                 return line, points
             factors = (1.0 - ask.forward_overlap - SPARE) / np.maximum(1.0 - shares, 1e-3)
@@ -236,7 +236,8 @@ class _Layout:
                 # in the end nothing may grow again, or shares would go to and fro
                 along = self._closer(along, factors if turn < 3 else np.minimum(factors, 1.0))
             else:
-                along = self._evenly(interval, line.base_m * float(np.clip(factors.min(), 0.3, FIRMLY)))
+                longest = line.base_m * float(np.clip(factors.min(), 0.3, FIRMLY))
+                along = self._evenly(interval, longest)
         raise self._impossible("forward", ask.forward_overlap, row)
 
     def _points(self, line: StationLine) -> Array:
