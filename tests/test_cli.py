@@ -9,14 +9,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 from typer.testing import CliRunner
 
+from tests.report.conftest import make_result_
 from uavkit import workflow
-from uavkit.cli import EXIT_DEFECT, EXIT_ERROR, EXIT_INTERRUPTED, INTERRUPTED, PlainProgress, app
+from uavkit.cli import EXIT_DEFECT, EXIT_ERROR, EXIT_INTERRUPTED, INTERRUPTED, PlainProgress, app, oriented_summary
 from uavkit.core.errors import DeviceError, InputError
 from uavkit.project import IngestOptions, Manifest, Project, Stage
 
@@ -57,6 +59,13 @@ def test_help_names_every_command() -> None:
 
 def test_the_version_is_told() -> None:
     assert uavkit("--version").stdout.startswith("uavkit 0.")
+
+
+def test_the_first_line_of_a_result_says_whether_it_is_provisional() -> None:
+    result = make_result_(strips=2, images_per_strip=4, points=300)
+    assert "PROVISIONAL" not in oriented_summary(result)[0]
+    result = replace(result, adjustment=replace(result.adjustment, converged=False))
+    assert "PROVISIONAL: the adjustment did not converge" in oriented_summary(result)[0]
 
 
 def test_a_mistake_of_the_user_is_one_line_on_stderr_and_status_2(tmp_path: Path) -> None:

@@ -486,6 +486,7 @@ def oriented_summary(result: "OrientedBlock") -> list[str]:
     lines = [
         f"{len(result.images)} of {total} stills oriented, {len(adjustment.points_m)} points, "
         f"datum: {adjustment.datum.value}, sigma0 {adjustment.sigma0:.2f}"
+        + ("" if adjustment.converged else ", PROVISIONAL: the adjustment did not converge")
     ]
     for name, points in (("control", result.control), ("check", result.check)):
         found = accuracy(points)

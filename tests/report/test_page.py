@@ -110,6 +110,14 @@ def test_headline_says_rmse_and_counts(page: Page, result: OrientedBlock) -> Non
     assert "sigma0 = 1.01 agrees with the sigmas" in page.text
 
 
+def test_headline_says_what_is_provisional(page: Page, result: OrientedBlock, tmp_path: Path) -> None:
+    provisional = replace(result, adjustment=replace(result.adjustment, converged=False))
+    words = "its results are provisional"
+    told = read(write_report(provisional, tmp_path)).text
+    assert told.index(words) < told.index("sigma0 = 1.01 agrees")
+    assert words not in page.text
+
+
 def test_interior_orientation_with_its_states(page: Page) -> None:
     rows = {row[0]: row[1:] for row in page.table("Parameter", "Adjusted")}
     assert rows["principal distance c [px]"] == ["2691.250", "2684.000", "30.000", "0.800", "determined"]

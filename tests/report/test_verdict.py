@@ -125,7 +125,32 @@ def test_strips_that_hang_by_few_points(make_result: MakeResult) -> None:
 
 
 def test_an_adjustment_that_did_not_converge(result: OrientedBlock) -> None:
-    assert "did not converge in 7 iterations" in said(adjusted(result, converged=False), Weight.LIMIT)
+    provisional = adjusted(result, converged=False)
+    assert "did not converge in 7 iterations: its results are provisional" in said(provisional, Weight.LIMIT)
+    assert said(result, Weight.GOOD)
+    assert not said(provisional, Weight.GOOD)
+
+
+def test_a_block_that_may_turn_about_its_control_is_badly_determined(result: OrientedBlock) -> None:
+    """A tilt of known sigma about a line is added to all points: known in shape, not in place."""
+    words = "The block is badly determined"
+    assert words not in said(result)
+    east = result.adjustment.points_m[:, 0]
+    off = np.abs(east - np.nanmedian(east))
+    for pixels, expected in ((1.0, False), (20.0, True)):
+        heights = (pixels * result.gsd_m * off / np.nanpercentile(off, 90.0)) ** 2
+        more = result.adjustment.point_covariances_m2 + heights[:, None, None] * np.diag([0.0, 0.0, 1.0])
+        tilted = adjusted(result, point_covariances_m2=more)
+        assert (words in said(tilted, Weight.LIMIT)) == expected
+        assert ("20 GSD" in said(tilted, Weight.LIMIT)) == expected
+    assert words not in said(adjusted(tilted, datum=Datum.GNSS))  # there the datum's own sentence says it
+
+
+def test_check_points_too_uncertain_to_show_a_bow_say_so(result: OrientedBlock) -> None:
+    vague = replace(result, check_covariance_m2=result.check_covariance_m2 * 1e6)
+    vague = replace(vague, check=tuple(replace(p, sigma_m=tuple(1e3 * s for s in p.sigma_m)) for p in vague.check))
+    assert "cannot tell whether the block is domed" in said(vague, Weight.WATCH)
+    assert "no doming found" not in said(vague)
 
 
 def test_strong_correlation_is_named_but_not_that_of_k1_to_k3(result: OrientedBlock) -> None:

@@ -16,7 +16,7 @@ from uavkit.report.coverage import ground_surface
 from uavkit.report.measures import accuracy, length_unit
 from uavkit.report.relative import relative_precision
 from uavkit.report.tables import PaperComparison
-from uavkit.report.verdict import Remark, Weight, remarks, sigma0_sentence
+from uavkit.report.verdict import Remark, Weight, provisional_sentence, remarks, sigma0_sentence
 
 PAGE_NAME = "report.html"
 DATUM_TEXTS = {
@@ -103,6 +103,8 @@ def _headline(result: OrientedBlock, title: str, date: str) -> str:
         for name, value, note in keys
     ]
     lines.append("</div>")
+    if not adjusted.converged:
+        lines.append(f"<p><b>{escape(provisional_sentence(adjusted.iterations).text)}</b></p>")
     lines.append(f"<p>{escape(sigma0_sentence(adjusted.sigma0, adjusted.redundancy).text)}</p>")
     lines.append(f"<p class='soft'>{escape('. '.join(about))}</p>")
     return "\n".join(lines)

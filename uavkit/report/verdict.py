@@ -31,6 +31,8 @@ PRACTICAL_TOLERANCE = 0.05
 FEW_TIES = 10
 WEAK_BOW_GSD = 2.0
 """Predicted sigma of a bow from which the heights count as badly determined: points are good to about half a pixel."""
+WEAK_PLACE_GSD = 5.0
+"""Predicted sigma from which a block that hangs on control points counts as badly determined."""
 FAR_FROM_PRIOR = 4.0
 """Sigmas between a parameter of the interior orientation and its a priori value."""
 
@@ -92,6 +94,7 @@ def remarks(result: OrientedBlock) -> list[Remark]:
         _stills,
         _convergence,
         _datum,
+        _place,
         _check_points,
         _interior,
         _doming,
@@ -103,6 +106,8 @@ def remarks(result: OrientedBlock) -> list[Remark]:
     sigma0 = sigma0_sentence(result.adjustment.sigma0, result.adjustment.redundancy)
     if sigma0.weight is not Weight.GOOD:  # the headline says it in any case
         found.insert(0, sigma0)
+    if not result.adjustment.converged:  # what is provisional is not in order, whatever the figures say
+        found = [remark for remark in found if remark.weight is not Weight.GOOD]
     order = list(Weight)
     return sorted(found, key=lambda remark: order.index(remark.weight))
 
@@ -115,11 +120,17 @@ def _stills(result: OrientedBlock) -> Iterator[Remark]:
         yield good(f"All {total} stills are oriented.")
 
 
+def provisional_sentence(iterations: int) -> Remark:
+    """Say what an adjustment that did not converge is worth."""
+    return limit(
+        f"The adjustment did not converge in {iterations} iterations: its results are provisional, do not use these "
+        f"numbers."
+    )
+
+
 def _convergence(result: OrientedBlock) -> Iterator[Remark]:
     if not result.adjustment.converged:
-        yield limit(
-            f"The adjustment did not converge in {result.adjustment.iterations} iterations: do not use these numbers."
-        )
+        yield provisional_sentence(result.adjustment.iterations)
     lost = int(np.sum(~determined_points(result)))
     if lost:
         yield watch(f"{lost} object points lost too many rays and have no coordinates; they are left out everywhere.")
@@ -153,6 +164,24 @@ def _gnss_datum_sentence(result: OrientedBlock, control_points: int) -> str:
         f"No ground control point: the absolute position rests on GNSS alone, whose common shift is taken as zero with "
         f"{sigma} (east / north / up). A shift within that sigma cannot be seen in this block."
     )
+
+
+def _place(result: OrientedBlock) -> Iterator[Remark]:
+    """Tell where control leaves the place of a block open, however well its shape is known."""
+    good = determined_points(result)
+    covariances = result.adjustment.point_covariances_m2
+    if result.adjustment.datum is not Datum.CONTROL or not good.any() or len(covariances) != len(good):
+        return
+    variances = np.diagonal(covariances[good], axis1=1, axis2=2)
+    squares = np.column_stack([variances[:, :2].sum(axis=1), variances[:, 2]])
+    sigmas, unit = np.sqrt(np.nanpercentile(squares, 90.0, axis=0)), length_unit(result)
+    if sigmas.max() > WEAK_PLACE_GSD * result.gsd_m:
+        yield limit(
+            f"The block is badly determined: one in ten of its points has a predicted sigma above "
+            f"{1e3 * sigmas[0]:.0f} {unit.thousandth} in position or {1e3 * sigmas[1]:.0f} {unit.thousandth} in height "
+            f"({sigmas.max() / result.gsd_m:.0f} GSD). Control points few or in a line let it turn about them; others "
+            f"away from that line would fix it."
+        )
 
 
 def _check_points(result: OrientedBlock) -> Iterator[Remark]:
@@ -233,6 +262,8 @@ def _doming(result: OrientedBlock) -> Iterator[Remark]:
         )
         if abs(test.bow_m) > 3.0 * test.sigma_m:
             yield limit(f"{text}: the block is domed.")
+        elif test.sigma_m > WEAK_PLACE_GSD * result.gsd_m:
+            yield watch(f"{text}: the check points cannot tell whether the block is domed.")
         else:
             yield good(f"{text}: no doming found.")
     yield from _curvature(result)
