@@ -1,7 +1,6 @@
 """Camera profiles: what is known of a camera type before it flies, as TOML files in ``hardware/cameras``."""
 
 import math
-import re
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -9,9 +8,10 @@ from pathlib import Path
 from pydantic import Field
 
 from uavkit.core.camera import CameraProfile, InteriorOrientation, InteriorSigmas
-from uavkit.core.errors import InputError, did_you_mean
+from uavkit.core.errors import InputError
 from uavkit.core.records import StillInfo
 from uavkit.formats.options_file import StrictModel, read_toml
+from uavkit.formats.profile_names import plain_name, profile_named
 
 PACKAGE = Path(__file__).resolve().parents[1]
 FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
@@ -110,24 +110,17 @@ def load_camera(name: str) -> CameraProfile:
     """
     if name.lower().endswith(".toml"):
         return read_camera(Path(name))
-    profiles, wanted = _profiles(camera_folder()), _plain(name)
-    for stem, profile in profiles.items():
-        if wanted and wanted in {_plain(word) for word in (stem, profile.name, *profile.models)}:
-            return profile
-    known = list_cameras()
-    spellings = {_plain(word): known_name for known_name in known for word in (known_name,)}
-    near = did_you_mean(wanted, spellings) or did_you_mean(name, known)
-    for plain, spelling in spellings.items():
-        near = near.replace(f"{plain!r}", f"{spelling!r}")
-    raise InputError(f"there is no camera {name!r}{near} Known: {', '.join(known)}; or give a TOML file of your own")
+    profiles = _profiles(camera_folder())
+    names = {key: (found.name, key, *found.models) for key, found in profiles.items()}
+    return profiles[profile_named("camera", name, names)]
 
 
 def camera_for_exif(maker: str, model: str) -> CameraProfile | None:
     """Return the profile of the camera that EXIF names, None where there is none: see ``camera_from_exif``."""
-    wanted = {_plain(model), _plain(model.casefold().removeprefix(maker.casefold()))} - {""}
+    wanted = {plain_name(model), plain_name(model.casefold().removeprefix(maker.casefold()))} - {""}
     for profile in _profiles(camera_folder()).values():
-        maker_fits = not maker.strip() or _plain(profile.maker)[:4] == _plain(maker)[:4]
-        if maker_fits and wanted & {_plain(known) for known in profile.models}:
+        maker_fits = not maker.strip() or plain_name(profile.maker)[:4] == plain_name(maker)[:4]
+        if maker_fits and wanted & {plain_name(known) for known in profile.models}:
             return profile
     return None
 
@@ -204,7 +197,3 @@ def interior_for_size(profile: CameraProfile, width_px: int, height_px: int) -> 
             y0_px=sigmas.y0_px * scale,
         ),
     )
-
-
-def _plain(name: str) -> str:
-    return re.sub(r"[\s\-_]+", "", name.casefold())

@@ -40,3 +40,13 @@ def rows_of_cells(
             hint = ": decimal commas are not accepted, write decimal points" if len(cells) > len(header) else ""
             raise InputError(f"{path}: line {number} has {len(cells)} cells, the header {len(header)}{hint}")
         yield number, dict(zip(header, cells, strict=True))
+
+
+def text_lines(path: Path) -> list[str]:
+    """Return the lines of a UTF-8 text; raises InputError where it cannot be read, or is none."""
+    try:
+        return path.read_bytes().decode("utf-8-sig").splitlines()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is no UTF-8 text (byte {error.start}): save it as UTF-8") from error

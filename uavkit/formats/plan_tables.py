@@ -26,7 +26,7 @@ from uavkit.core.arrays import Array
 from uavkit.core.errors import InputError, did_you_mean
 from uavkit.core.flightplan import AreaKind, FlightPlan, PlannedExposures, SurveyArea, Trigger, Waypoint, WaypointRole
 from uavkit.formats.atomic import write_text
-from uavkit.formats.commented_csv import comment_keys, rows_of_cells
+from uavkit.formats.commented_csv import comment_keys, rows_of_cells, text_lines
 
 _COUNTS = ("exposure", "strip", "station", "sortie")
 _MEASURES = {
@@ -89,7 +89,7 @@ def _one_line(text: str) -> str:
 
 def read_exposures_csv(path: Path) -> PlannedExposures:
     """Read the exposures; raises InputError naming file and line for whatever cannot be understood."""
-    lines = _lines(path)
+    lines = text_lines(path)
     keys, rows = comment_keys(path, lines, ("plan", "camera", "vertical")), list(rows_of_cells(path, lines, _check))
     if not rows:
         raise InputError(f"{path}: the file holds no exposure below its header")
@@ -125,15 +125,6 @@ def _exposures(
         gsd_m=np.column_stack([values["gsd_least_m"], values["gsd_mean_m"], values["gsd_greatest_m"]]),
         sees_area=sees_area,
     )
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_bytes().decode("utf-8-sig").splitlines()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is no UTF-8 text (byte {error.start}): save it as UTF-8") from error
 
 
 def _check(where: str, header: list[str]) -> None:

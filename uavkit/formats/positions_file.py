@@ -26,7 +26,7 @@ from uavkit.core.frames import geographic_from_crs, parse_crs
 from uavkit.core.heights import HeightDatum
 from uavkit.core.records import GnssFix
 from uavkit.formats.atomic import write_text
-from uavkit.formats.commented_csv import comment_keys, rows_of_cells
+from uavkit.formats.commented_csv import comment_keys, rows_of_cells, text_lines
 
 _GEOGRAPHIC = ("latitude_deg", "longitude_deg")
 _PROJECTED = ("easting_m", "northing_m")
@@ -56,7 +56,7 @@ class ImagePositions:
 
 def read_image_positions(path: Path) -> ImagePositions:
     """Read the CSV; raises InputError naming file and line for whatever cannot be understood."""
-    lines = _lines(path)
+    lines = text_lines(path)
     keys, rows = comment_keys(path, lines, _KEYS), list(rows_of_cells(path, lines, _check_header))
     if not rows:
         raise InputError(f"{path}: the file holds no position below its header")
@@ -93,15 +93,6 @@ def write_image_positions(path: Path, positions: ImagePositions) -> None:
         sigmas = (*(fix.sigma_east_north_m or (fix.sigma_horizontal_m,) * 2), fix.sigma_vertical_m)
         writer.writerow([fix.name, *place, *("" if sigma is None else repr(sigma) for sigma in sigmas)])
     write_text(path, stream.getvalue())
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_bytes().decode("utf-8-sig").splitlines()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is no UTF-8 text (byte {error.start}): save it as UTF-8") from error
 
 
 def _check_header(where: str, header: list[str]) -> None:

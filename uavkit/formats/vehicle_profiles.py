@@ -1,15 +1,15 @@
 """Vehicle profiles: the limits of a type of vehicle, as TOML files in ``hardware/vehicles``."""
 
-import re
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
 
-from uavkit.core.errors import InputError, did_you_mean
+from uavkit.core.errors import InputError
 from uavkit.core.vehicle import VehicleKind, VehicleProfile
 from uavkit.formats.options_file import StrictModel, read_toml
+from uavkit.formats.profile_names import profile_named
 
 PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -72,17 +72,5 @@ def load_vehicle(name: str) -> VehicleProfile:
     """
     if name.lower().endswith(".toml"):
         return read_vehicle(Path(name))
-    profiles, wanted = _profiles(vehicle_folder()), _plain(name)
-    for stem, profile in profiles.items():
-        if wanted and wanted in (_plain(stem), _plain(profile.name)):
-            return profile
-    spellings = {_plain(known): known for known in list_vehicles()}
-    near = did_you_mean(wanted, spellings)
-    for plain, spelling in spellings.items():
-        near = near.replace(f"{plain!r}", f"{spelling!r}")
-    known_names = ", ".join(spellings.values())
-    raise InputError(f"there is no vehicle {name!r}{near} Known: {known_names}; or give a TOML file of your own")
-
-
-def _plain(name: str) -> str:
-    return re.sub(r"[\s\-_]+", "", name.casefold())
+    profiles = _profiles(vehicle_folder())
+    return profiles[profile_named("vehicle", name, {key: (found.name, key) for key, found in profiles.items()})]

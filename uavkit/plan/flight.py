@@ -208,10 +208,11 @@ def divide(
 
 def _too_short(limits: SortieLimits, away_s: float, not_even_one: bool) -> InputError:
     what = "not even one image" if not_even_one else f"no more than the {limits.overlap_stations} repeated images"
+    held = [] if np.isinf(limits.duration_s) else [f"{limits.duration_s / 60.0:.1f} min (endurance minus reserve)"]
+    held += [] if np.isinf(limits.items) else [f"{limits.items:g} mission items"]
     return InputError(
-        f"a sortie of {limits.duration_s / 60.0:.1f} min (endurance minus reserve) and {limits.items:g} mission items "
-        f"leaves time for {what}, since the way to the area and back takes {away_s / 60.0:.1f} min: take off nearer "
-        f"to it, fly faster, reduce the reserve, or take another vehicle"
+        f"a sortie of {' and '.join(held)} has room for {what}, since the way to the area and back takes "
+        f"{away_s / 60.0:.1f} min: take off nearer to it, fly faster, reduce the reserve, or take another vehicle"
     )
 
 
