@@ -225,7 +225,6 @@ def test_many_plans_over_hills(case: Case) -> None:
 
 
 @pytest.mark.parametrize("shape", [7, 11, 24, 40, 45])
-@pytest.mark.xfail(strict=False, reason="exposures are brought closer from row to row where nothing asks for it")
 def test_flat_ground_takes_no_more_images_than_its_strips_need(shape: int) -> None:
     """Over flat ground a strip holds its overlap with the base asked for: no need to bring exposures closer."""
     case = Case(
