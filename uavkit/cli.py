@@ -392,8 +392,8 @@ def plan(
     }
     request = request_of(area, given)
     folder = out or (survey / "plan" if survey else Path(request.name))
-    first = 0 if resume_after is None else resume_after + 1
-    made = workflow.plan(request, area.parent, folder, first)
+    with progress_shown() as progress:
+        made = workflow.plan(request, area.parent, folder, 0 if resume_after is None else resume_after + 1, progress)
     _say(made.lines)
     typer.echo(f"Plan: {folder}\nPage: {made.page}")
 

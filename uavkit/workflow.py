@@ -72,7 +72,9 @@ def simulate(out: Path, values: Mapping[str, Any], progress: Progress = silent) 
     return " ".join(["uavkit ingest SURVEY", *(f"{name} {path}" for name, path in ingest_arguments(made, options))])
 
 
-def plan(source: "PlanRequest", beside: Path, out: Path, first_station: int = 0) -> "PlanMade":
+def plan(
+    source: "PlanRequest", beside: Path, out: Path, first_station: int = 0, progress: Progress = silent
+) -> "PlanMade":
     """Plan a flight by a request whose paths count from a folder, and write its files to a folder."""
     from uavkit.plan.inputs import read_inputs, self_contained
     from uavkit.plan.outputs import refuse_other_contents, write_outputs
@@ -82,9 +84,17 @@ def plan(source: "PlanRequest", beside: Path, out: Path, first_station: int = 0)
     refuse_other_contents(out)
     found = read_inputs(source, beside)
     planned = plan_survey(
-        source, found.areas, found.camera, found.elevation, found.vehicle, found.fences, first_station=first_station
+        source,
+        found.areas,
+        found.camera,
+        found.elevation,
+        found.vehicle,
+        found.fences,
+        first_station=first_station,
+        progress=progress,
     )
-    left_out = write_outputs(out, planned, self_contained(source, beside, found), found.elevation, found.vehicle)
+    kept = self_contained(source, beside, found)
+    left_out = write_outputs(out, planned, kept, found.elevation, found.vehicle, progress)
     return PlanMade(lines=[*summary_lines(planned, source), *left_out], page=out / f"{planned.plan.name}.html")
 
 

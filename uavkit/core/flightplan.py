@@ -176,7 +176,7 @@ class PlanSummary:
     height_above_ground_m: tuple[float, float, float]
     """Least, mean, greatest at the exposures."""
     least_clearance_m: float
-    """Of the whole path above the terrain model, minus that model's stated error."""
+    """Of the whole path above the terrain model, minus twice that model's sigma."""
     least_images: int
     """Fewest images that see a point of the area."""
     covered: float

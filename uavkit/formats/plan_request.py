@@ -59,7 +59,7 @@ class TerrainRequest(StrictModel):
     tolerance: float = Field(default=0.1, gt=0, lt=1)
     """Of the height above ground along the strips, as a share of it."""
     least_clearance_m: float = Field(default=5.0, ge=0, le=1000)
-    """Of the whole path above the terrain model minus its stated error."""
+    """Of the whole path above the terrain model minus twice its sigma."""
 
 
 class FlightRequest(StrictModel):

@@ -14,7 +14,8 @@ from uavkit.formats.camera_profiles import load_camera
 from uavkit.formats.elevation_file import read_elevation
 from uavkit.formats.plan_request import InlineArea, PlanRequest
 from uavkit.formats.vehicle_profiles import load_vehicle
-from uavkit.plan.planner import KINDS, Fences
+from uavkit.plan.planner import Fences
+from uavkit.plan.site import KINDS
 
 DEGREE_M = 111_000.0
 BESIDE_M = 3000.0

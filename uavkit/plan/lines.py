@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from uavkit.core.arrays import Array, Flags
 from uavkit.core.errors import InputError
+from uavkit.core.progress import Progress, silent
 from uavkit.plan.ground import Ground
 from uavkit.plan.imaging import Imaging
 from uavkit.plan.kernels import simplified
@@ -42,6 +43,7 @@ class Mounting:
     """Straight flight before the first and after the last exposure."""
     stops: bool
     """The vehicle stops at every exposure."""
+    progress: Progress = silent
 
 
 @dataclass(frozen=True, kw_only=True)

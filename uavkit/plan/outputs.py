@@ -1,10 +1,12 @@
 """The files of a plan: one folder, whole or not at all."""
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 from uavkit.core.errors import InputError
 from uavkit.core.flightplan import FlightPlan
+from uavkit.core.progress import Progress, silent
 from uavkit.core.surface import ElevationGrid
 from uavkit.core.vehicle import VehicleKind, VehicleProfile
 from uavkit.formats.atomic import write_text
@@ -30,6 +32,7 @@ def write_outputs(
     request: PlanRequest,
     elevation: ElevationGrid | None,
     vehicle: VehicleProfile | None,
+    progress: Progress = silent,
 ) -> list[str]:
     """Write all files of a plan into a folder, in place of those of an earlier plan, and return what was left out.
 
@@ -40,7 +43,7 @@ def write_outputs(
     try:
         shutil.rmtree(fresh, ignore_errors=True)
         fresh.mkdir(parents=True)
-        notes = _write_all(fresh, planned, request, elevation, vehicle)
+        notes = _write_all(fresh, planned, request, elevation, (vehicle, progress))
         old = folder.with_name(folder.name + ".old")
         shutil.rmtree(old, ignore_errors=True)
         if folder.exists():
@@ -72,17 +75,23 @@ def _write_all(
     planned: Planned,
     request: PlanRequest,
     elevation: ElevationGrid | None,
-    vehicle: VehicleProfile | None,
+    how: tuple[VehicleProfile | None, Progress],
 ) -> list[str]:
+    vehicle, progress = how
     plan, name = planned.plan, planned.plan.name
-    write_text(folder / f"{name}.toml", request_text(request))
-    write_flightplan(folder / f"{name}{SUFFIX}", plan)
-    write_plan_kml(folder / f"{name}.kml", plan, planned.footprints_deg)
-    write_plan_geojson(folder / f"{name}.geojson", plan, planned.footprints_deg)
-    write_exposures_csv(folder / f"{name}_exposures.csv", plan)
-    write_summary_json(folder / f"{name}_summary.json", planned, request)
-    write_plan_picture(folder / f"{name}.png", planned, request, elevation)
-    write_plan_page(folder / f"{name}.html", planned, request, elevation, _items(plan, vehicle))
+    writers: tuple[Callable[[], object], ...] = (
+        lambda: write_text(folder / f"{name}.toml", request_text(request)),
+        lambda: write_flightplan(folder / f"{name}{SUFFIX}", plan),
+        lambda: write_plan_kml(folder / f"{name}.kml", plan, planned.footprints_deg),
+        lambda: write_plan_geojson(folder / f"{name}.geojson", plan, planned.footprints_deg),
+        lambda: write_exposures_csv(folder / f"{name}_exposures.csv", plan),
+        lambda: write_summary_json(folder / f"{name}_summary.json", planned, request),
+        lambda: write_plan_picture(folder / f"{name}.png", planned, request, elevation),
+        lambda: write_plan_page(folder / f"{name}.html", planned, request, elevation, _items(plan, vehicle)),
+    )
+    for number, write in enumerate(writers, start=1):
+        write()
+        progress("write the plan's files", number, len(writers))
     if len(plan.sorties) > 1 or plan.exposures.station[0] > 0:
         write_text(folder / f"{name}_resume.toml", _resume_text(plan))
     notes: list[str] = []

@@ -121,6 +121,8 @@ class _Layout:
         rows = [low + inset]
         while rows[-1] < high - inset - 0.02 * self.distance_m:
             rows.append(rows[-1] + self._distance_after(rows[-1], even))
+            done = min(rows[-1] - low, high - inset - low) / max(high - inset - low, 1e-9)
+            self.strips.mounting.progress(f"lay strips over {self.strips.area}", int(100.0 * done), 100)
             refuse_too_many(len(rows) * (self.bounds[2] - self.bounds[0]) / self.base_m / 20.0, self.strips.area)
         return rows
 
