@@ -18,10 +18,6 @@ MOST_MIB = 1024.0
 MOST_S_PER_10KM2 = 5.0
 MOST_S_PER_KM2 = 1.0
 
-MISSED = pytest.mark.xfail(
-    strict=False, reason="36 700 images over 10 km2 took 11 s of the processor, 3600 over 1 km2 1.1 s"
-)
-
 SCRIPT = """
 import json, math, resource, sys, time
 import numpy as np
