@@ -27,6 +27,10 @@ ENOUGH_EVENTS = 3
 VOTE_EVERY = (4, 40)
 """Frames between two measurements of the field order: until there are ``ENOUGH_VOTES``, and afterwards."""
 ENOUGH_VOTES = 12
+FAINT_SPREAD = 4.0
+"""Spread of cells below which ground is faint, grey values; ordinary ground has 8 and more."""
+FAINT_JUMP = 0.35
+"""Grey values by which the end of a frozen picture shows there."""
 STILL_FIELDS = 12
 """Distance of two fields that show whether a picture stands still: far enough for a hovering camera to move."""
 
@@ -219,12 +223,23 @@ def _end_of_frozen(fields: _Fields, begin: int) -> int:
     away = _difference(fields, places, first)
     step = _difference(fields, places, places - 2)
     usual = np.array([np.median(step[: max(k, 2)]) for k in range(len(step))])
+    if float(np.median(fields.spread[places])) < FAINT_SPREAD:
+        return _end_of_faint_frozen(places, away, step > 2.0 * usual + 0.15)
     jumps = np.flatnonzero(step > 3.0 * usual + 0.5)
     left = np.flatnonzero(away > 1.2 + 2.0 * float(step[:2].mean()))
     gone = int(left[0]) if len(left) else len(places)
     if len(jumps) and 4 <= jumps[0] <= gone:
         return int(places[jumps[0]])
     return begin if gone < 10 or not len(left) else int(places[gone])
+
+
+def _end_of_faint_frozen(places: Indices, away: Array, jumped: Flags) -> int:
+    """Return the first live field on faint ground: a jump, (k,), farther from the first field than any before it, (k,).
+
+    There a jump is little larger than the noise, and motion alone takes long to show.
+    """
+    ends = np.flatnonzero(jumped[1:] & (away[1:] > np.maximum.accumulate(away)[:-1] + FAINT_JUMP)) + 1
+    return int(places[ends[0]]) if len(ends) and ends[0] >= 4 else int(places[0]) - 2
 
 
 def _frozen_runs(fields: _Fields, taken: Flags) -> list[tuple[int, int]]:
