@@ -5,9 +5,26 @@ import numpy as np
 import pytest
 
 from tests.process.video_of_truth import FIELD_S, MARGIN, OVER, SHAPE, Scene, fields, make_scene, positions, straight
-from uavkit.process.orientation_code import orientation_codes, richness, select_points
+from uavkit.process.orientation_code import (
+    PointMatches,
+    orientation_codes,
+    packed_codes,
+    richness,
+    select_points,
+)
 from uavkit.process.repetition import repeat_shifts, tone_costs, tone_of, wide_motion
-from uavkit.process.tracking import TimedPicture, TrackingResult, square_field, track
+from uavkit.process.tracking import (
+    TimedPicture,
+    TrackingResult,
+    _Alignment,
+    _by_region,
+    _climbed,
+    _Found,
+    _Judge,
+    square_field,
+    start,
+    track,
+)
 
 PLANTS_PX, ROWS_PX = 10.0, 18.0
 SECONDS = 2.5
@@ -88,3 +105,44 @@ def test_tone_costs_nothing_at_the_same_place_and_much_elsewhere():
     assert np.all(tone_costs(tone, tone, places, places, unit) < 1e-6)
     assert np.all(tone_costs(tone, tone, places, places + [3 * PLANTS_PX, 2 * ROWS_PX], unit) > 0.2)
     assert np.isnan(tone_costs(tone, tone, places[:1] * 0, places[:1], unit[:1])).all()
+
+
+def test_a_side_that_slipped_a_period_is_put_right():
+    """From a motion whose one side is a period off, all between adapted to it, the right one is found."""
+    scene, pose = rows_of_plants(np.random.default_rng(2), 4.0), straight((60.0, 20.0), SECONDS, sway_px=0.0)
+    (_, first, _), (parity, lines, time_s) = fields(scene, pose, 31, np.random.default_rng(3), every=30)
+    before, after = square_field(first, 0), square_field(lines, parity)
+    points = select_points(richness(orientation_codes(before), 25, 0.5), 32, 1, 40)
+    state = start(TimedPicture(image=before, time_s=0.0), points)
+    judge = _Judge(packed_codes(after), tone_of(after), None)
+    slipped = np.array([[1.0 + PLANTS_PX / 640, 0.0, 60.0 * time_s / SECONDS], [0.0, 1.0, 20.0 * time_s / SECONDS]])
+    ways = _climbed(state, judge, [slipped], np.random.default_rng(0))
+    truth = positions(scene, points, pose(time_s))
+    assert np.mean(np.hypot(*(ways[0].found.points_px - truth).T) < 2.0) > 0.95
+
+
+def test_each_region_goes_the_way_that_is_cheapest_there():
+    """Two alignments, each right on one side of the picture, make one that is right everywhere."""
+    points = np.stack(np.meshgrid(np.arange(40.0, 600.0, 20.0), np.arange(40.0, 440.0, 20.0)), axis=-1).reshape(-1, 2)
+    state = start(TimedPicture(image=picture_of(rows_of_plants(np.random.default_rng(1), 4.0)), time_s=0.0), points)
+    rng, left = np.random.default_rng(4), points[:, 0] < 320
+    unit, right_px = np.eye(2, 3), points + [3.0, 1.0]
+    ways = []
+    for side in (left, ~left):
+        found_px = np.where(side[:, None], right_px, right_px + [PLANTS_PX, 0.0])
+        everything = np.ones(len(points))
+        matches = PointMatches(
+            points_px=found_px,
+            dissimilarity=everything,
+            ambiguity=everything,
+            on_rim=everything < 0,
+            coded_share=everything,
+        )
+        found = _Found(
+            matches=matches, good=everything > 0, points_px=found_px, step=unit, residuals_px=found_px - points
+        )
+        ways.append(_Alignment(unit, rng.normal(np.where(side, 1.4, 1.6), 0.5), found))
+    (whole,) = _by_region(state, ways, rng)
+    wrong = np.hypot(*(whole.found.points_px - right_px).T) > 1.0
+    assert np.mean(wrong) < 0.1
+    assert not wrong[np.abs(points[:, 0] - 320) > 100].any()

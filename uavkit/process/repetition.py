@@ -22,6 +22,8 @@ WIDE_TONE_PX = 12.0
 """Standard deviation of the smoothing that is taken off: tone wider than this is no repetition."""
 LEAST_REPETITION = 0.6
 """Correlation of a window with itself at a shift, from which it repeats itself; in random texture some 0.15."""
+NEARLY = 0.9
+"""Share of the highest peak's height from which a shorter shift counts as well."""
 LEAST_SHIFT_PX = 4
 MOST_SHIFT_PX = 40
 LEAST_WINDOWS = 0.5
@@ -45,20 +47,24 @@ TONE_STEPS_PX = np.arange(-30.0, 31.0, 10.0)
 def repeat_shifts(image: Grey) -> Array:
     """Return shifts (k, 2), in columns and rows, at which a picture repeats itself; none for ordinary ground.
 
-    Of each window that repeats itself, the shift of the highest peak of its autocorrelation off the middle.
+    Of each window that repeats itself, the shift of the highest peak of its autocorrelation off the middle, and of the
+    shortest that is nearly as high: the highest may be a multiple.
     """
     fine = image.astype(np.float32)
     fine -= cv2.GaussianBlur(fine, (0, 0), WIDE_TONE_PX)
     rows, columns = (np.arange(0, size - WINDOW_PX + 1, WINDOW_PX) for size in image.shape)
     found = [_repetition(fine[r : r + WINDOW_PX, c : c + WINDOW_PX]) for r in rows for c in columns]
-    shifts = [shift for shift, value in found if value >= LEAST_REPETITION]
-    if len(shifts) < max(1.0, LEAST_WINDOWS * len(found)):
+    shifts = [shift for pair, value in found if value >= LEAST_REPETITION for shift in pair]
+    if len(shifts) / 2 < max(1.0, LEAST_WINDOWS * len(found)):
         return np.zeros((0, 2))
     return np.unique(np.array(shifts, dtype=np.float64), axis=0)
 
 
-def _repetition(window: Small) -> tuple[tuple[int, int], float]:
-    """Return the shift of the highest peak off the middle of a window's autocorrelation, and its height (1: exact)."""
+def _repetition(window: Small) -> tuple[list[tuple[int, int]], float]:
+    """Return the shifts of two peaks off the middle of a window's autocorrelation, and the height of the first.
+
+    The first is the highest (1: exact), the second the shortest that is nearly as high.
+    """
     tapered = (window - window.mean()) * np.outer(*(np.hanning(size) for size in window.shape))
     padded = tuple(2 * size for size in window.shape)
     power = np.abs(np.fft.rfft2(tapered, padded)) ** 2
@@ -67,15 +73,18 @@ def _repetition(window: Small) -> tuple[tuple[int, int], float]:
     reach = np.arange(-MOST_SHIFT_PX, MOST_SHIFT_PX + 1)
     part = raw[np.ix_(reach, reach)] / np.maximum(least[np.ix_(reach, reach)], 1e-3 * least[0, 0])
     if part[MOST_SHIFT_PX, MOST_SHIFT_PX] <= 0.25:
-        return (0, 0), 0.0
+        return [], 0.0
     part = part / part[MOST_SHIFT_PX, MOST_SHIFT_PX]
     around = cv2.dilate(part, np.ones((3, 3)))
-    peak = (part >= around) & (np.hypot(*np.meshgrid(reach, reach)) >= LEAST_SHIFT_PX)
+    length = np.hypot(*np.meshgrid(reach, reach))
+    peak = (part >= around) & (length >= LEAST_SHIFT_PX)
     peak[:MOST_SHIFT_PX] = False
     if not peak.any():
-        return (0, 0), 0.0
-    row, column = np.unravel_index(int(np.argmax(np.where(peak, part, -1.0))), part.shape)
-    return (int(reach[column]), int(reach[row])), float(part[row, column])
+        return [], 0.0
+    highest = int(np.argmax(np.where(peak, part, -1.0)))
+    nearly = peak & (part >= NEARLY * part.flat[highest])
+    places = [divmod(at, len(reach)) for at in (highest, int(np.argmin(np.where(nearly, length, np.inf))))]
+    return [(int(reach[column]), int(reach[row])) for row, column in places], float(part.flat[highest])
 
 
 def wide_motion(before: Grey, after: Grey) -> tuple[Array, float]:

@@ -14,6 +14,7 @@ followed side by side until the pictures decide; where they do not, nothing is f
 from collections.abc import Iterable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -125,6 +126,8 @@ class TrackingResult:
     pictures_used: int
     gaps: int
     """Pictures that were unusable."""
+    repeats: bool
+    """Whether the ground repeats itself: what is more than half a period off finds a wrong place."""
 
 
 def predict(result: TrackingResult, time_s: float) -> Array:
@@ -450,6 +453,8 @@ def _alignments(state: TrackState, picture: TimedPicture, judge: _Judge, rng: np
     if likeness < _LEAST_LIKENESS:
         return []
     ways = _climbed(state, judge, _likely_motions(state, judge, wide), rng)
+    if len(ways) > 1:
+        ways = sorted([*_by_region(state, ways, rng), *ways], key=lambda way: way.mean)
     kept: list[_Alignment] = []
     for way in ways:
         same = any(_median_distance(way.found.points_px, one.found.points_px) < _SAME_PX for one in kept)
@@ -467,13 +472,47 @@ def _climbed(state: TrackState, judge: _Judge, motions: list[Array], rng: np.ran
         ways = sorted([*ways, *(way for way in fresh if way is not None)], key=lambda way: way.mean)
         if not ways or ways[0].mean >= best:
             break
-        motions = [
-            ways[0].motion + np.column_stack([np.zeros((2, 2)), ways[0].motion[:, :2] @ state.affine[:, :2] @ shift])
-            for shift in _repeats_either_way(state.repeats_px)
-        ]
+        motions = _slipped(state, ways[0].motion)
     return ways
 
 
+def _by_region(state: TrackState, ways: list[_Alignment], rng: np.random.Generator) -> list[_Alignment]:
+    """One alignment of the parts of several: each point goes the way that is cheapest to the region about it.
+
+    Relief shifts parts of a picture by more than half a period; no single alignment is right there. Regions are wide,
+    for the costs of a few points tell one period from the next no better than chance. Empty where the points of the
+    result do not move together.
+    """
+    costs = np.stack([way.cost for way in ways])
+    size = min(len(state.start_px), max(_LEAST_REGION, round(_REGION * len(state.start_px))))
+    _, region = cKDTree(state.start_px).query(state.start_px, k=size)
+    chosen = np.argmin(np.nan_to_num(costs - costs[0])[:, region].mean(axis=2), axis=0)
+    rows = np.arange(len(chosen))
+
+    def of_chosen(values: list[Any]) -> Any:
+        return np.stack(values)[chosen, rows]
+
+    good = np.asarray(of_chosen([way.found.good for way in ways]), np.bool_)
+    points = np.asarray(of_chosen([way.found.points_px for way in ways]))
+    matches = PointMatches(
+        points_px=of_chosen([way.found.matches.points_px for way in ways]),
+        dissimilarity=of_chosen([way.found.matches.dissimilarity for way in ways]),
+        ambiguity=of_chosen([way.found.matches.ambiguity for way in ways]),
+        on_rim=of_chosen([way.found.matches.on_rim for way in ways]),
+        coded_share=of_chosen([way.found.matches.coded_share for way in ways]),
+    )
+    try:
+        step = fit_affine_robustly(state.points_px[good], points[good], rng).target_from_source
+    except AdjustmentError:
+        return []
+    residuals = points - apply_affine(step, state.points_px)
+    found = _Found(matches=matches, good=good, points_px=points, step=step, residuals_px=residuals)
+    return [_Alignment(step, np.asarray(of_chosen(list(costs))), found)]
+
+
+_REGION = 0.12
+"""Share of all points that decide together on the way of one."""
+_LEAST_REGION = 24
 _LEAST_LIKENESS = 0.5
 """Correlation of tone below which it tells nothing, and any period would be a guess."""
 _MOST_CLIMBS = 6
@@ -503,13 +542,36 @@ def _likely_motions(state: TrackState, judge: _Judge, motion: Array) -> list[Arr
     return [motion + shifts[index] for index in np.argsort(costs, kind="stable")[:_LIKELY_SHIFTS]]
 
 
-def _repeats_either_way(repeats_px: Array) -> list[Array]:
-    """Those of the shifts (k, 2) that differ, and the same backwards."""
+def _slipped(state: TrackState, motion: Array) -> list[Array]:
+    """Motions (2, 3) that a repeating ground takes for a motion: one period off everywhere, or on one side only.
+
+    Where a side of the picture is matched one period off, all between adapts to it: scale or rotation is wrong by the
+    period over the width of the picture.
+    """
+    middle, size = state.points_px.mean(axis=0), np.ptp(state.points_px, axis=0) / 2 + 1.0
+    result = []
+    for shift in _shortest(state.repeats_px):
+        moved = motion[:, :2] @ state.affine[:, :2] @ shift
+        for sign in (1.0, -1.0):
+            result.append(motion + np.column_stack([np.zeros((2, 2)), sign * moved]))
+            for axis, side in ((0, 0.5), (0, -0.5), (1, 0.5), (1, -0.5)):
+                slope = side * np.eye(2)[axis] / size[axis]  # 0 on one side of the picture, 1 on the other
+                by_place = np.append(slope, 0.5 - slope @ middle)
+                result.append(motion + sign * np.outer(moved, by_place))
+    return result
+
+
+_MOST_PERIODS = 2
+
+
+def _shortest(repeats_px: Array) -> list[Array]:
+    """Those of the shifts (k, 2) of which the others are multiples, the shortest first."""
     apart: list[Array] = []
-    for shift in repeats_px:
-        if all(np.hypot(*(shift - other)) > 2 * _SAME_PX for other in apart):
+    for shift in repeats_px[np.argsort(np.hypot(*repeats_px.T), kind="stable")]:
+        multiples = (round(float(shift @ one / (one @ one))) * one for one in apart)
+        if all(np.hypot(*(shift - multiple)) > 2 * _SAME_PX for multiple in multiples):
             apart.append(shift)
-    return [sign * shift for shift in apart for sign in (1, -1)]
+    return apart[:_MOST_PERIODS]
 
 
 def _refined(state: TrackState, judge: _Judge, motion: Array, rng: np.random.Generator) -> _Alignment | None:
@@ -909,6 +971,7 @@ def _result(state: TrackState) -> TrackingResult:
         time_s=state.time_s,
         pictures_used=state.pictures_used,
         gaps=state.gaps,
+        repeats=state.repeats,
     )
 
 

@@ -236,7 +236,7 @@ def _gap_key(
     sync = given.sync
     return content_hash(
         [
-            "video 4",
+            "video 5",
             given.video.fingerprint(),
             given.store.fingerprint(image),
             given.store.fingerprint(target),
@@ -257,9 +257,11 @@ def _follow_gap(
 ) -> Arrays:
     """Track points of one still to the next, descend to its pixels, and measure them against their references."""
     helpers.expect(target)
-    tracked_px, tracked, there_from_here = track_between_stills(given, places, points.here_px, helpers)
+    (tracked_px, tracked, there_from_here), repeats = _tracked(given, places, points.here_px, helpers)
     helpers.as_video(target)  # waits until the pictures of the target are there: they need not be made twice
-    xy, extended, there_from_here = extend_motion(points.here_px, tracked_px, tracked, there_from_here)
+    xy, extended = tracked_px, np.zeros_like(tracked)
+    if not repeats:  # predictions are off by more than half a period: tie point matching will find these points
+        xy, extended, there_from_here = extend_motion(points.here_px, tracked_px, tracked, there_from_here)
     warps = there_from_here @ points.here_from_reference
     found = np.zeros(len(xy), dtype=bool)
     jobs = [
@@ -346,26 +348,32 @@ def track_between_stills(
 
     Returns where they are there (n, 2) in still pixels, which were found, and there_from_here (n, 2, 2) about each.
     """
-    helpers = helpers or Helpers(given)
+    return _tracked(given, places, here_px, helpers or Helpers(given))[0]
+
+
+def _tracked(
+    given: VideoInput, places: tuple[StillInVideo, StillInVideo], here_px: Array, helpers: Helpers
+) -> tuple[tuple[Array, Flags, Array], bool]:
+    """Return what ``track_between_stills`` does, and whether the ground repeats itself."""
     nothing = here_px.copy(), np.zeros(len(here_px), dtype=bool), np.tile(np.eye(2), (len(here_px), 1, 1))
     video_from_still = given.sync.still_from_video.inverse()
     info = given.video.info()
     start = video_from_still.apply(here_px)
     inside = np.all((start > 12) & (start < np.array([info.width_px - 13, info.height_px - 13])), axis=1)
     if int(inside.sum()) < 6:
-        return nothing
+        return nothing, False
     pictures = pictures_between(given, places, helpers)
     try:
         result = track(pictures, start[inside], rng=np.random.default_rng(places[0].last_frame), pool=helpers.pool)
     except InputError:
-        return nothing
+        return nothing, False
     end_s = places[1].exposure_time_ns * 1e-9
     xy, alive, warps = nothing
     xy[inside] = given.sync.still_from_video.apply(result.points_px)
     alive[inside] = result.alive & (abs(result.time_s - end_s) < 1e-6)
     scale = given.sync.still_from_video.matrix
     warps[inside] = scale @ result.warps @ np.linalg.inv(scale)
-    return xy, alive, warps
+    return (xy, alive, warps), result.repeats
 
 
 def pictures_between(
