@@ -19,13 +19,16 @@ from tests.process.made_blocks import (
 from uavkit.core.adjustment import Datum
 from uavkit.core.block import Block
 from uavkit.core.camera import InteriorOrientation, InteriorSigmas
+from uavkit.core.errors import AdjustmentError
 from uavkit.core.points import ControlPoint, ImageMark
+from uavkit.process.absolute import fit_similarity
 from uavkit.process.approximations import GrowingBlock
 from uavkit.process.candidates import Candidates
 from uavkit.process.network import (
     MarkedPoints,
     Network,
     adjust_network,
+    adjust_what_holds,
     interior_sigmas,
     marked_points,
     network_of,
@@ -274,3 +277,37 @@ def test_a_still_of_too_few_shared_points_is_left_out_and_named() -> None:
     left = without_weak_stills(growing, candidates, marked)
     assert left.oriented.tolist() == [True, True, False]
     assert left.reasons == {2: "only 7 of its points were found in other stills too (8 needed)"}
+
+
+def _spoilt(network: Network, stills: tuple[int, ...], rng: np.random.Generator) -> Network:
+    """The network with gross errors, 20 to 200 px in any direction, in all rays of some stills."""
+    xy = network.xy_px.copy()
+    rows = np.flatnonzero(np.isin(network.image, stills))
+    angle = rng.uniform(0.0, 2.0 * np.pi, len(rows))
+    xy[rows] += rng.uniform(20.0, 200.0, len(rows))[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    return replace(network, xy_px=xy)
+
+
+def test_stills_whose_rays_are_wrong_are_left_out_and_the_others_adjusted() -> None:
+    """All rays of the last two stills are wrong: nothing holds these, and the error they were is no more."""
+    block = _block()
+    network, marked = _network(block)
+    network = _spoilt(network, (6, 7), np.random.default_rng(5))
+    with pytest.raises(AdjustmentError):
+        adjust_network(network, block, marked, AdjustmentSection(), Datum.FREE_NETWORK)
+    held = adjust_what_holds(network, block, marked, AdjustmentSection(), Datum.FREE_NETWORK)
+    assert held.adjusted.images.tolist() == [0, 1, 2, 3, 4, 5]
+    assert sorted(held.reasons) == [6, 7]
+    assert all("too few of its points agree" in reason for reason in held.reasons.values())
+    truth = np.array([p.projection_centre_m for p in PLACES])[:6]
+    centres = held.adjusted.result.projection_centres_m
+    assert np.abs(fit_similarity(centres, truth).apply(centres) - truth).max() < 0.03
+    assert np.isnan(updated(held.network, held.adjusted).centres[6:]).all()
+
+
+def test_rays_that_determine_nothing_are_an_error() -> None:
+    block = _block()
+    network, marked = _network(block)
+    network = _spoilt(network, tuple(range(8)), np.random.default_rng(6))
+    with pytest.raises(AdjustmentError):
+        adjust_what_holds(network, block, marked, AdjustmentSection(), Datum.FREE_NETWORK)

@@ -16,6 +16,8 @@ from uavkit.core.errors import AdjustmentError
 from uavkit.core.observations import Rays
 from uavkit.core.progress import Progress
 from uavkit.process.bundle import adjust_block
+from uavkit.process.bundle_system import UndeterminedError
+from uavkit.process.holding import MOST_LOOSENED, loose_stills
 
 RESECTION_TOLERANCE_PX = 10.0
 """A point agrees with a resection within this: lens distortion is not yet known."""
@@ -30,6 +32,8 @@ _ROUGH_SIGMA_PX = 1.0
 _MOST_POINTS_PER_STILL = 300
 GROWTH = 1.5
 """The block is adjusted each time it has grown by this factor."""
+CLEAN = 0.9
+"""With a smaller share of good rays it is adjusted after each still: gross errors show in a block that is right."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,15 +106,15 @@ def orient_approximately(
             failed[image] = _known_points_in(block, rays)[image]
             continue
         if image is None:
-            image = _attach(block, rays)
+            image = _attach(block, rays, [still for still, count in failed.items() if count == GIVEN_UP])
             if image is None:
                 break
         _intersect(block, rays, image)
         if int(block.oriented.sum()) >= next_adjustment:
-            rays = _adjust(block, rays, sigmas)
-            next_adjustment = int(np.ceil(GROWTH * block.oriented.sum()))
+            rays, clean = _adjust(block, rays, sigmas, failed)
+            next_adjustment = int(np.ceil((GROWTH if clean else 1.0) * block.oriented.sum()))
         progress("approximate orientation", int(block.oriented.sum()), counts[0])
-    rays = _adjust(block, rays, sigmas)
+    rays, _ = _adjust(block, rays, sigmas, failed)
     _explain(block, rays)
     return block
 
@@ -230,7 +234,7 @@ def _resect(block: GrowingBlock, rays: RayTable, image: int) -> bool:
     return True
 
 
-def _attach(block: GrowingBlock, rays: RayTable) -> int | None:
+def _attach(block: GrowingBlock, rays: RayTable, given_up: list[int]) -> int | None:
     """Orient a still by relative orientation to an oriented one, its base scaled by a few points known already.
 
     The way of the aeropolygon: where stills overlap little more than half, hardly a point is seen in three, too few
@@ -239,6 +243,7 @@ def _attach(block: GrowingBlock, rays: RayTable) -> int | None:
     common = common_points(rays, len(block.centres))
     common[~block.oriented] = 0
     common[:, block.oriented] = 0
+    common[:, given_up] = 0
     for flat in np.argsort(-common, axis=None, kind="stable")[:40].tolist():
         here, image = divmod(flat, len(common))
         if common[here, image] < LEAST_PAIR_POINTS:
@@ -342,11 +347,50 @@ def _intersect(block: GrowingBlock, rays: RayTable, image: int | None = None) ->
     block.points[numbers] = points
 
 
-def _adjust(block: GrowingBlock, rays: RayTable, sigmas: InteriorSigmas) -> RayTable:
-    """Adjust the block so far as a free network; returns the rays with directions of the new interior orientation."""
-    images = np.flatnonzero(block.oriented)
-    rows = np.flatnonzero(block.oriented[rays.image] & block.known[rays.point])
-    rows = rows[_well_spread(rays.image[rows], rays.point[rows], len(block.points))]
+def _adjust(
+    block: GrowingBlock, rays: RayTable, sigmas: InteriorSigmas, failed: dict[int, int]
+) -> tuple[RayTable, bool]:
+    """Adjust the block so far as a free network, without stills that nothing holds: those count as ``failed``.
+
+    Returns the rays with directions of the new interior orientation, and whether most of them are free of gross errors.
+    """
+    for _ in range(MOST_LOOSENED):
+        images = np.flatnonzero(block.oriented)
+        rows = np.flatnonzero(block.oriented[rays.image] & block.known[rays.point])
+        rows = rows[_well_spread(rays.image[rows], rays.point[rows], len(block.points))]
+        try:
+            result = _adjusted(block, rays, (images, rows), sigmas)
+        except UndeterminedError as error:
+            held = rows[error.used]
+            loose = loose_stills(np.searchsorted(images, rays.image[held]), rays.point[held], len(images))
+            if len(loose) == 0 or len(images) - len(loose) < 2:
+                break
+            block.centres[images[loose]] = np.nan
+            _intersect(block, rays)
+            seen = _known_points_in(block, rays)
+            failed.update(
+                {still: GIVEN_UP if still in failed else int(seen[still]) for still in images[loose].tolist()}
+            )
+            continue
+        except AdjustmentError:  # a still that hangs by few points yet: the next ones will hold it, or leave it out
+            break
+        block.interior = result.interior
+        block.centres[images], block.rotations[images] = result.projection_centres_m, result.R_object_from_image
+        rays = ray_table(rays.point, rays.image, rays.xy_px, block.interior)
+        _intersect(block, rays)
+        return rays, float(np.mean(result.ray_used)) >= CLEAN
+    return rays, False
+
+
+GIVEN_UP = 1 << 30
+"""Known points that a still waits for which turned out to be loose after another failure."""
+
+
+def _adjusted(
+    block: GrowingBlock, rays: RayTable, chosen: tuple[Indices, Indices], sigmas: InteriorSigmas
+) -> AdjustmentResult:
+    """Return the adjustment of chosen stills and rays as a free network."""
+    images, rows = chosen
     points, point_index = np.unique(rays.point[rows], return_inverse=True)
     observations = AdjustmentInput(
         interior=block.interior,
@@ -362,15 +406,7 @@ def _adjust(block: GrowingBlock, rays: RayTable, sigmas: InteriorSigmas) -> RayT
         ),
     )
     options = AdjustmentOptions(datum=Datum.FREE_NETWORK, most_iterations=15, convergence=0.05, point_covariances=False)
-    try:
-        result = adjust_block(observations, options)
-    except AdjustmentError:  # a still that hangs by few points yet: the next ones will hold it, or leave it out
-        return rays
-    block.interior = result.interior
-    block.centres[images], block.rotations[images] = result.projection_centres_m, result.R_object_from_image
-    rays = ray_table(rays.point, rays.image, rays.xy_px, block.interior)
-    _intersect(block, rays)
-    return rays
+    return adjust_block(observations, options)
 
 
 def _well_spread(image: Indices, point: Indices, count: int) -> Indices:

@@ -58,7 +58,8 @@ def adjust_block(
 ) -> AdjustmentResult:
     """Adjust a block: see ``AdjustmentInput``, ``AdjustmentOptions`` and ``AdjustmentResult``.
 
-    Raises AdjustmentError where the observations do not determine the unknowns, saying which.
+    Raises AdjustmentError where the observations do not determine the unknowns, saying which; UndeterminedError, with
+    the rays that were left, where they did before robust weights were found.
     """
     options = options or AdjustmentOptions()
     datum = options.datum or choose_datum(observations)

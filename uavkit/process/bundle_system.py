@@ -34,6 +34,16 @@ SMALL = 2000
 SINGULAR_DAMPING = 1e-5
 """Up to this, damping carries an iteration past a state of singular equations; at its end they must not be singular."""
 
+
+class UndeterminedError(AdjustmentError):
+    """The rays that robust weights left do not determine the unknowns."""
+
+    def __init__(self, message: str, used: Flags) -> None:
+        super().__init__(message)
+        self.used = used
+        """Which rays of the input had weight, (k,)."""
+
+
 NONE_FREE = Free(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
 
 T = TypeVar("T")
@@ -439,15 +449,15 @@ def gauss_newton_step(system: BundleSystem, state: State, weights: Weights, damp
     """Return the state after one step that does not increase the weighted sum of squares.
 
     A step that does is halved (Armijo 1966); where that does not help, damping grows (Levenberg 1944).
-    Raises AdjustmentError where the observations do not determine the unknowns.
+    Raises UndeterminedError where the observations do not determine the unknowns.
     """
     datum = inner_datum(system, state)
     while damping < 1e6:
         reduced, determined = reduced_normals(system, state, weights, damping)
         before = cost(system, state, weights, determined)
         try:
-            factor = system.factorise(reduced, damping, datum)
-        except AdjustmentError:
+            factor = _factored(system, weights, reduced, (damping, datum))
+        except UndeterminedError:
             if damping > SINGULAR_DAMPING:
                 raise
             damping = max(damping * 100.0, 1e-8)
@@ -467,6 +477,18 @@ def gauss_newton_step(system: BundleSystem, state: State, weights: Weights, damp
                 )
         damping = max(damping * 10.0, 1e-8)
     raise AdjustmentError("the adjustment does not converge: no step lessens the sum of squared residuals")
+
+
+def _factored(
+    system: BundleSystem, weights: Weights, reduced: Reduced, held: tuple[float, InnerDatum | None]
+) -> ReducedFactor:
+    """Factor normal equations with damping and datum; an error carries which rays had weight."""
+    try:
+        return system.factorise(reduced, *held)
+    except AdjustmentError as error:
+        used = np.empty(len(system.order), dtype=np.bool_)
+        used[system.order] = weights.rays > 0.0
+        raise UndeterminedError(str(error), used) from error
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -560,7 +582,7 @@ class Precision:
 def precision_at(system: BundleSystem, state: State, weights: Weights) -> Precision:
     """Return the precision of all unknowns at a state, for the sigmas stated a priori."""
     reduced, determined = reduced_normals(system, state, weights, 0.0)
-    factor = system.factorise(reduced, 0.0, inner_datum(system, state))
+    factor = _factored(system, weights, reduced, (0.0, inner_datum(system, state)))
     inverse = factor.inverse()
     coordinates = control_coordinates(system, state, weights)
     covariances, leverage = np.empty((len(state.points), 3, 3)), np.empty((len(system.order), 2))

@@ -12,7 +12,9 @@ from uavkit.core.observations import ControlObservations, GnssObservations, Rays
 from uavkit.core.points import CheckPoint, ControlPoint
 from uavkit.process.approximations import GrowingBlock, RayTable, intersect_without_worst, ray_table
 from uavkit.process.bundle import adjust_block
+from uavkit.process.bundle_system import UndeterminedError
 from uavkit.process.candidates import Candidates
+from uavkit.process.holding import MOST_LOOSENED, loose_stills
 from uavkit.process.options import AdjustmentSection
 
 MISFIT_PX = 15.0
@@ -147,6 +149,49 @@ class AdjustedNetwork:
     rays: Rays
     ray_rows: Indices
     """Rows of the network's rays."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeldNetwork:
+    """An adjusted network without the stills that turned out to be loose."""
+
+    network: Network
+    adjusted: AdjustedNetwork
+    reasons: dict[int, str]
+    """Why each loose still was left out, by its row."""
+
+
+def adjust_what_holds(
+    network: Network,
+    block: Block,
+    marked: MarkedPoints,
+    options: AdjustmentSection,
+    datum: Datum | None,
+) -> HeldNetwork:
+    """Adjust; stills that the rays free of gross errors do not hold are left out, with the reason.
+
+    Raises AdjustmentError where what is left determines nothing.
+    """
+    reasons: dict[int, str] = {}
+    for _ in range(MOST_LOOSENED):
+        try:
+            adjusted = adjust_network(network, block, marked, options, datum)
+            return HeldNetwork(network=network, adjusted=adjusted, reasons=reasons)
+        except UndeterminedError as error:
+            images = np.flatnonzero(np.isfinite(network.centres[:, 0]))
+            rows = _rays_to_use(network, marked, datum is Datum.FREE_NETWORK)[error.used]
+            held = np.searchsorted(images, network.image[rows])
+            loose = images[loose_stills(held, network.point[rows], len(images))]
+            if len(loose) == 0 or len(images) - len(loose) < 2:
+                raise
+        centres = network.centres.copy()
+        centres[loose] = np.nan
+        network = replace(network, centres=centres)
+        for still in loose.tolist():
+            agree = np.count_nonzero(network.image[rows] == still)
+            reasons[still] = f"too few of its points agree with the other stills to hold it ({agree} agree at all)"
+    adjusted = adjust_network(network, block, marked, options, datum)
+    return HeldNetwork(network=network, adjusted=adjusted, reasons=reasons)
 
 
 def adjust_network(

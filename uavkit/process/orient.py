@@ -28,10 +28,10 @@ from uavkit.process.features import feature_tasks, match_features, pairs_to_comp
 from uavkit.process.filling import RichPlaces, fill, rich_places
 from uavkit.process.measurement import measure_rays
 from uavkit.process.network import (
-    AdjustedNetwork,
+    HeldNetwork,
     MarkedPoints,
     Network,
-    adjust_network,
+    adjust_what_holds,
     interior_sigmas,
     marked_points,
     network_of,
@@ -116,22 +116,21 @@ def orient_block(
         network, oriented_absolutely = _to_object_space(place, tied.network, marked)
     with place.step("adjustment"):
         place.progress("adjustment", 0, 1)
-        adjusted = adjust_network(
-            network, block, marked, place.options.adjustment, None if oriented_absolutely else Datum.FREE_NETWORK
-        )
+        datum = None if oriented_absolutely else Datum.FREE_NETWORK
+        held = adjust_what_holds(network, block, marked, place.options.adjustment, datum)
         place.progress("adjustment", 1, 1)
     with place.step("summary"):
         found = Findings(
             block=block,
-            reasons=tied.reasons,
+            reasons={**tied.reasons, **held.reasons},
             candidates=tied.found,
             tied=tied.tied,
-            network=network,
+            network=held.network,
             marked=marked,
-            adjusted=adjusted,
+            adjusted=held.adjusted,
         )
         result = summarise(found, stills, place.pyramids)
-    notes = (*place.notes, *adjusted.result.notes)
+    notes = (*place.notes, *held.adjusted.result.notes)
     return replace(result, seconds=place.seconds, notes=notes, peak_memory_mb=peak_memory_mb())
 
 
@@ -272,10 +271,9 @@ def _tie(place: Workplace, candidates: Candidates, growing: GrowingBlock, marked
     for turn in (1, 2):
         with place.step("free network"):
             growing = without_weak_stills(growing, tied, marked)
-            network = network_of(growing, tied, marked)
-            adjusted = _free_network(place, network, marked)
-            growing = _regrown(growing, updated(network, adjusted))
-        geometry = object_geometry(growing, adjusted, len(candidates), candidates.reference_image)
+            held = _free_network(place, network_of(growing, tied, marked), marked)
+            growing = _regrown(growing, held)
+        geometry = object_geometry(growing, held.adjusted, len(candidates), candidates.reference_image)
         with place.step("tie points"):
             tied = matching.match(candidates, geometry, known)
             apart = points_apart(tied, 0.5 * place.options.measurement.window_px)
@@ -288,13 +286,12 @@ def _tie(place: Workplace, candidates: Candidates, growing: GrowingBlock, marked
             tied = known
     with place.step("free network"):
         growing = without_weak_stills(growing, tied, marked)
-        network = network_of(growing, tied, marked)
-        adjusted = _free_network(place, network, marked)
-        network, calibration = calibrated(updated(network, adjusted), adjusted)
+        held = _free_network(place, network_of(growing, tied, marked), marked)
+        network, calibration = calibrated(updated(held.network, held.adjusted), held.adjusted)
         _note_calibration(place, calibration)
     if dropped:
         place.notes.append(f"points left out because their matching windows overlap others': {dropped}")
-    return _Tied(found=found, tied=tied, network=network, reasons=growing.reasons)
+    return _Tied(found=found, tied=tied, network=network, reasons={**growing.reasons, **held.reasons})
 
 
 def _filling(
@@ -320,20 +317,21 @@ def _filling(
     return fresh
 
 
-def _free_network(place: Workplace, network: Network, marked: MarkedPoints) -> AdjustedNetwork:
+def _free_network(place: Workplace, network: Network, marked: MarkedPoints) -> HeldNetwork:
     place.progress("free network adjustment", 0, 1)
-    adjusted = adjust_network(network, place.block, marked, place.options.adjustment, Datum.FREE_NETWORK)
+    held = adjust_what_holds(network, place.block, marked, place.options.adjustment, Datum.FREE_NETWORK)
     place.progress("free network adjustment", 1, 1)
-    return adjusted
+    return held
 
 
-def _regrown(growing: GrowingBlock, network: Network) -> GrowingBlock:
+def _regrown(growing: GrowingBlock, held: HeldNetwork) -> GrowingBlock:
+    network = updated(held.network, held.adjusted)
     return GrowingBlock(
         interior=network.interior,
         centres=network.centres,
         rotations=network.rotations,
         points=network.points[: network.marks_from],
-        reasons=growing.reasons,
+        reasons={**growing.reasons, **held.reasons},
     )
 
 
