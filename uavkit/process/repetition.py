@@ -5,6 +5,9 @@ rows, tone of wide extent, does not repeat: pictures smoothed until the rows are
 the enhanced correlation coefficient (Evangelidis and Psarakis 2008), coarse to fine.
 """
 
+from functools import lru_cache
+from itertools import product
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -52,10 +55,17 @@ def repeat_shifts(image: Grey) -> Array:
     """
     fine = image.astype(np.float32)
     fine -= cv2.GaussianBlur(fine, (0, 0), WIDE_TONE_PX)
-    rows, columns = (np.arange(0, size - WINDOW_PX + 1, WINDOW_PX) for size in image.shape)
-    found = [_repetition(fine[r : r + WINDOW_PX, c : c + WINDOW_PX]) for r in rows for c in columns]
-    shifts = [shift for pair, value in found if value >= LEAST_REPETITION for shift in pair]
-    if len(shifts) / 2 < max(1.0, LEAST_WINDOWS * len(found)):
+    rows, columns = (range(0, size - WINDOW_PX + 1, WINDOW_PX) for size in image.shape)
+    count, shifts, without = len(rows) * len(columns), list[tuple[int, int]](), 0
+    for row, column in product(rows, columns):
+        pair, value = _repetition(fine[row : row + WINDOW_PX, column : column + WINDOW_PX])
+        if value >= LEAST_REPETITION:
+            shifts += pair
+        else:
+            without += 1
+        if count - without < max(1.0, LEAST_WINDOWS * count):  # ordinary ground shows it soon
+            return np.zeros((0, 2))
+    if count == 0:
         return np.zeros((0, 2))
     return np.unique(np.array(shifts, dtype=np.float64), axis=0)
 
@@ -66,10 +76,7 @@ def _repetition(window: Small) -> tuple[list[tuple[int, int]], float]:
     The first is the highest (1: exact), the second the shortest that is nearly as high.
     """
     tapered = (window - window.mean()) * np.outer(*(np.hanning(size) for size in window.shape))
-    padded = tuple(2 * size for size in window.shape)
-    power = np.abs(np.fft.rfft2(tapered, padded)) ** 2
-    envelope = np.abs(np.fft.rfft2(np.outer(*(np.hanning(size) for size in window.shape)), padded)) ** 2
-    raw, least = np.fft.irfft2(power, padded), np.fft.irfft2(envelope, padded)
+    raw, least = _autocorrelation(tapered), _autocorrelation_of_taper(window.shape)
     reach = np.arange(-MOST_SHIFT_PX, MOST_SHIFT_PX + 1)
     part = raw[np.ix_(reach, reach)] / np.maximum(least[np.ix_(reach, reach)], 1e-3 * least[0, 0])
     if part[MOST_SHIFT_PX, MOST_SHIFT_PX] <= 0.25:
@@ -85,6 +92,16 @@ def _repetition(window: Small) -> tuple[list[tuple[int, int]], float]:
     nearly = peak & (part >= NEARLY * part.flat[highest])
     places = [divmod(at, len(reach)) for at in (highest, int(np.argmin(np.where(nearly, length, np.inf))))]
     return [(int(reach[column]), int(reach[row])) for row, column in places], float(part.flat[highest])
+
+
+def _autocorrelation(window: Array) -> Array:
+    padded = tuple(2 * size for size in window.shape)
+    return np.asarray(np.fft.irfft2(np.abs(np.fft.rfft2(window, padded)) ** 2, padded))
+
+
+@lru_cache(maxsize=4)
+def _autocorrelation_of_taper(shape: tuple[int, int]) -> Array:
+    return _autocorrelation(np.outer(*(np.hanning(size) for size in shape)))
 
 
 def wide_motion(before: Grey, after: Grey) -> tuple[Array, float]:
