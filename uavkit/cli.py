@@ -391,7 +391,10 @@ def plan(
         "sorties.split_at_items": split or None,
     }
     request = request_of(area, given)
-    folder = out or (survey / "plan" if survey else Path(request.name))
+    if out and survey:
+        raise typer.BadParameter("give --out or --survey, one of them")
+    rest = "" if resume_after is None else f"_after_{resume_after}"
+    folder = out or (survey / f"plan{rest}" if survey else Path(f"{request.name}{rest}"))
     with progress_shown() as progress:
         made = workflow.plan(request, area.parent, folder, 0 if resume_after is None else resume_after + 1, progress)
     _say(made.lines)

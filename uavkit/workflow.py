@@ -95,7 +95,10 @@ def plan(
     )
     kept = self_contained(source, beside, found)
     left_out = write_outputs(out, planned, kept, found.elevation, found.vehicle, progress)
-    return PlanMade(lines=[*summary_lines(planned, source), *left_out], page=out / f"{planned.plan.name}.html")
+    return PlanMade(
+        lines=[*summary_lines(planned, source), *(f"  note: {text}" for text in (*found.notes, *left_out))],
+        page=out / f"{planned.plan.name}.html",
+    )
 
 
 def check_plan(path: Path, camera: str, terrain: "TerrainRequest", speed_m_s: float | None = None) -> list[str]:

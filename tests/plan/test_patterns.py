@@ -10,9 +10,11 @@ import shapely
 
 from tests.plan.made_requests import CAMERA, MAP, SQUARE, area, hills, request, vehicle
 from uavkit.core.errors import InputError
-from uavkit.core.flightplan import AreaKind, FlightPlan
+from uavkit.core.flightplan import AreaKind, FlightPlan, WaypointRole
+from uavkit.core.mission import MissionCommand
 from uavkit.core.surface import ElevationGrid
 from uavkit.core.vehicle import VehicleKind
+from uavkit.plan.mission import mission_of
 from uavkit.plan.planner import Fences, plan_survey
 
 RIVER = [(-200.0, -40.0), (-60.0, 10.0), (60.0, -60.0), (200.0, 30.0)]
@@ -127,6 +129,26 @@ def test_orbit_looks_at_the_object_from_all_around() -> None:
     assert plan.summary.forward_overlap[0] > 0.75
 
 
+@pytest.mark.parametrize("trigger", ["hover", "distance"])
+def test_flight_that_begins_above_its_take_off_point_takes_off_first(trigger: str) -> None:
+    asked = request(
+        pattern="orbit",
+        orbit={"radius_m": 30.0, "object_height_m": 10.0},
+        imaging={"height_above_ground_m": 15.0},
+        flight={"trigger": trigger},
+    )
+    plan = plan_survey(asked, (area([(20.0, 10.0)], AreaKind.POINT),), CAMERA).plan
+    roles = [point.role for point in plan.sorties[0].waypoints]
+    assert roles[0] is WaypointRole.TAKEOFF
+    assert roles[-1] is WaypointRole.RETURN
+    commands = [item.command for item in mission_of(plan, 0, "ardupilot", "take_off").items]
+    assert commands[0] == MissionCommand.TAKEOFF
+    first_picture = commands.index(
+        MissionCommand.DO_DIGICAM_CONTROL if trigger == "hover" else MissionCommand.DO_SET_CAM_TRIGG_DIST
+    )
+    assert commands.index(MissionCommand.DO_MOUNT_CONTROL) < first_picture
+
+
 def test_several_areas_are_one_plan() -> None:
     other = area([(400.0, 0.0), (480.0, 0.0), (480.0, 90.0), (400.0, 90.0)], name="second")
     plan = plan_survey(request(), (area(SQUARE), other), CAMERA).plan
@@ -155,7 +177,11 @@ def with_void() -> ElevationGrid:
         ({}, {"vehicle": vehicle(endurance_s=60.0)}, "take off nearer"),
         ({"sorties": {"most_items": 20}}, {}, "items, the autopilot holds 20: divide it"),
         ({"terrain": {"file": "x"}}, {"elevation": with_void()}, "void of the terrain model at latitude 47.0"),
-        ({"terrain": {"file": "x"}, "flight": {"greatest_height_above_ground_m": 45.0}}, {}, "the law .* fly lower"),
+        (
+            {"terrain": {"file": "x"}, "flight": {"greatest_height_above_ground_m": 45.0}},
+            {},
+            "the law .* allows 45 m: fly lower",
+        ),
         ({"terrain": {"file": "x", "least_clearance_m": 60.0}}, {}, "under the clearance of 60 m: fly higher"),
         ({"flight": {"take_off_deg": (8.0, 47.0)}}, {}, "latitude comes first"),
         ({"pattern": "corridor", "corridor": {"width_m": 9.0}}, {}, "the pattern corridor needs a line"),

@@ -84,6 +84,15 @@ def test_the_rest_of_a_flight_is_planned(field: Path) -> None:
     assert stations[0] == 28  # three images are taken again
 
 
+def test_the_rest_does_not_take_the_place_of_the_whole(field: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(field.parent)
+    assert run("plan", field, *USUAL)[0] == 0
+    assert run("plan", Path("field") / "field.toml", "--resume-after", 30)[0] == 0
+    assert read_flightplan(Path("field") / "field.flightplan.json").exposures.station[0] == 0
+    assert read_flightplan(Path("field_after_30") / "field.flightplan.json").exposures.station[0] == 28
+    assert run("plan", field, *USUAL, "--out", "a", "--survey", "b")[0] == 2
+
+
 @pytest.mark.parametrize("kind", ["field.plan", "field.waypoints", "field.flightplan.json"])
 @pytest.mark.parametrize("trigger", ["distance", "hover"])
 def test_a_check_tells_what_the_planner_told(field: Path, kind: str, trigger: str) -> None:

@@ -3,7 +3,7 @@
 The exposures' CSV::
 
     # uavkit exposures
-    # vertical: ellipsoid
+    # vertical: ellipsoid     (take-off, where the plan had no terrain model: heights above the take-off point)
     exposure,strip,station,sortie,time_s,latitude_deg,longitude_deg,height_m,height_above_ground_m,heading_deg,...
 
 Rotations are omega, phi, kappa of R_map_from_image in axes east, north, up at the exposure; exposures, strips and
@@ -74,7 +74,7 @@ def write_exposures_csv(path: Path, plan: FlightPlan) -> None:
     counts = np.column_stack([np.arange(1, len(table) + 1), table.strip + 1, table.station, table.sortie + 1])
     stream = io.StringIO()
     stream.write(f"# uavkit exposures\n# plan: {_one_line(plan.name)}\n# camera: {_one_line(plan.camera)}\n")
-    stream.write("# vertical: ellipsoid\n")
+    stream.write(f"# vertical: {'ellipsoid' if plan.terrain else 'take-off'}\n")
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(_COLUMNS)
     for count, row, sees in zip(counts.tolist(), measures.tolist(), table.sees_area.tolist(), strict=True):
@@ -93,9 +93,11 @@ def read_exposures_csv(path: Path) -> PlannedExposures:
     keys, rows = comment_keys(path, lines, ("plan", "camera", "vertical")), list(rows_of_cells(path, lines, _check))
     if not rows:
         raise InputError(f"{path}: the file holds no exposure below its header")
-    if keys.get("vertical", (0, "ellipsoid"))[1] != "ellipsoid":
+    if keys.get("vertical", (0, "ellipsoid"))[1] not in ("ellipsoid", "take-off"):
         number, value = keys["vertical"]
-        raise InputError(f"{path}: line {number}: heights of exposures are above the ellipsoid, not {value!r}")
+        raise InputError(
+            f"{path}: line {number}: heights of exposures count from the ellipsoid or the take-off, not {value!r}"
+        )
     counts = {name: np.array([_whole(path, row, name) for row in rows], dtype=np.int64) for name in _COUNTS}
     for number, (line, _) in enumerate(rows, start=1):
         if counts["exposure"][number - 1] != number:

@@ -92,7 +92,7 @@ def _stations(path: Path, plan: FlightPlan, flight: Sortie) -> list[_Station]:
 
 
 def _check_speed(path: Path, speed_m_s: float) -> None:
-    if not 0.0 < speed_m_s <= _FASTEST_M_S:
+    if not 0.0 < speed_m_s <= _FASTEST_M_S * (1.0 + 1e-9):
         raise InputError(
             f"{path}: a leg is flown at {speed_m_s:g} m/s, DJI's format takes up to {_FASTEST_M_S:g} m/s: change "
             f"speed_m_s in [flight]"

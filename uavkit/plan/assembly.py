@@ -431,7 +431,7 @@ def _notes(
 ) -> list[str]:
     notes = []
     if vehicle is None:
-        notes.append("no vehicle was named: endurance is not checked, and the flight is one sortie")
+        notes.append("no vehicle was named: endurance and wind are not checked")
     asked = request.flight.speed_m_s
     if asked is None:
         notes.append(f"speed on the strips: {flies.speed_m_s:.1f} m/s")

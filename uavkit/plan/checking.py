@@ -27,6 +27,8 @@ from uavkit.plan.patterns import LaidSet
 
 PARALLEL_RAD = np.radians(12.0)
 """Strips whose directions differ by less run beside one another."""
+LOOKING_DOWN = 0.7
+"""Cosine of the mean angle from the nadir below which a camera looks down."""
 LEAST_PITCH_DEG = -5.0
 """A camera that looks higher than this sees no ground to speak of."""
 
@@ -50,8 +52,8 @@ class CheckedPlan:
     worst_place_deg: tuple[float, float]
     """Latitude and longitude of the end of the leg with the least clearance."""
     least_base_m: float
-    sinks: tuple[str, ...] = ()
-    """What is wrong, in words."""
+    warnings: tuple[str, ...] = ()
+    """What is wrong, or what the figures do not tell, in words."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,8 +247,15 @@ def _checked(stations: _Stations, path: Array, ground: Ground, imaging: Imaging)
         least_clearance_m=float(np.min(clearance)),
         worst_place_deg=(float(path[worst, 0]), float(path[worst, 1])),
         least_base_m=min(bases, default=float("nan")),
-        sinks=("the path runs into the ground",) if float(np.min(clearance)) < 0.0 else (),
+        warnings=_warnings(float(np.min(clearance)), np.concatenate([line.rotations for line in lines])),
     )
+
+
+def _warnings(clearance_m: float, rotations: Array) -> tuple[str, ...]:
+    found = ["the path runs into the ground"] if clearance_m < 0.0 else []
+    if float(np.mean(rotations[:, 2, 2])) < LOOKING_DOWN:
+        found.append("the camera looks ahead more than down: all figures are of the ground, not of a facade or object")
+    return tuple(found)
 
 
 def _between_exposures(path_m: Array, lines: list[StationLine]) -> tuple[int, int]:
@@ -357,7 +366,7 @@ def _elevation(terrain: TerrainRequest, places_deg: Array) -> ElevationGrid | No
 def _told(found: CheckedPlan, terrain: TerrainRequest) -> list[str]:
     gsd, above = found.gsd_m, found.height_above_ground_m
     rows = [
-        ("images", f"{found.images} in {found.strips} strips, least base {found.least_base_m:.2f} m"),
+        ("images", _count(found)),
         (
             "ground distance of a pixel",
             f"{1e3 * gsd[0]:.1f} / {1e3 * gsd[1]:.1f} / {1e3 * gsd[2]:.1f} mm (least, mean, most)",
@@ -371,7 +380,13 @@ def _told(found: CheckedPlan, terrain: TerrainRequest) -> list[str]:
     lines = [f"{name:<{width}}  {text}" for name, text in rows]
     if not terrain.file:
         lines.append("note: without a terrain model the ground is taken as flat at the take-off point")
-    return lines + [f"warning: {text}" for text in found.sinks]
+    lines.append("note: side overlap is that of all images, those at the rim of the area too")
+    return lines + [f"warning: {text}" for text in found.warnings]
+
+
+def _count(found: CheckedPlan) -> str:
+    base = "" if np.isnan(found.least_base_m) else f", least base {found.least_base_m:.2f} m"
+    return f"{found.images} in {found.strips} strips{base}"
 
 
 def _shares(shares: tuple[float, float]) -> str:
@@ -379,6 +394,8 @@ def _shares(shares: tuple[float, float]) -> str:
 
 
 def _clearance(found: CheckedPlan, terrain: TerrainRequest) -> str:
+    if np.isnan(found.least_clearance_m):
+        return "none: no path between exposures"
     latitude, longitude = found.worst_place_deg
     less = " less twice the terrain model's error" if terrain.file else ""
     return f"{found.least_clearance_m:.1f} m{less}, near latitude {latitude:.6f}, longitude {longitude:.6f}"

@@ -238,8 +238,8 @@ def check_heights(path_m: Array, ground: Ground, request: PlanRequest, first_lev
     if legs[highest, 1] > most + 1e-6:
         raise InputError(
             f"the path is {legs[highest, 1]:.0f} m above the ground {_near(ground, path_m[first_level + highest])}, "
-            f"the law (greatest_height_above_ground_m) allows {most:g} m: fly lower, follow the ground, or divide "
-            f"the area"
+            f"greatest_height_above_ground_m, the law where you fly, allows {most:g} m: fly lower, follow the "
+            f"ground, or divide the area"
         )
     return float(clearance[worst]), float(legs[highest, 1])
 

@@ -117,7 +117,7 @@ def draw_plan(axes: "Axes", scene: Scene) -> dict[str, bool]:
     _scale_bar(axes, extent)
     _north_arrow(axes)
     axes.legend(
-        loc="lower left", bbox_to_anchor=(-0.01, 1.0), ncols=4, borderaxespad=0.2, handletextpad=0.5, columnspacing=1.2
+        loc="lower left", bbox_to_anchor=(-0.01, 1.0), ncols=3, borderaxespad=0.2, handletextpad=0.5, columnspacing=1.2
     )
     return drawn
 

@@ -132,8 +132,12 @@ class Airfield:
 
 
 def home_legs(field: Airfield, place: Array, set_number: int) -> Array:
-    """Return the path (k, 3) from the take-off point on the ground to a place."""
-    return field.over((field.home_m, place), set_number)
+    """Return the path (k, 3) from the take-off point on the ground to a place, by at least one place in between.
+
+    That is where the take-off ends, also where the place lies right above the take-off point.
+    """
+    path = field.over((field.home_m, place), set_number)
+    return path if len(path) > 2 else np.stack([field.home_m, place, place])
 
 
 def cumulative_times(lines: Sequence[tuple[int, StationLine]], times: Sequence[LineTimes], flies: Performance) -> Array:

@@ -31,6 +31,7 @@ class PlanInputs:
     elevation: ElevationGrid | None
     vehicle: VehicleProfile | None
     fences: Fences
+    notes: tuple[str, ...] = ()
 
 
 def read_inputs(request: PlanRequest, folder: Path) -> PlanInputs:
@@ -40,7 +41,11 @@ def read_inputs(request: PlanRequest, folder: Path) -> PlanInputs:
     """
     areas = inline_areas(request.areas) if request.areas else read_areas(_path(folder, request.area_file))
     fitting = tuple(area for area in areas if area.kind in KINDS[request.pattern])
+    left_out = [area.name for area in areas if fitting and area.kind not in KINDS[request.pattern]]
     return PlanInputs(
+        notes=(f"left out, no {' or '.join(kind.value for kind in KINDS[request.pattern])}: {', '.join(left_out)}",)
+        if left_out
+        else (),
         areas=fitting or areas,
         camera=load_camera(str(_path(folder, request.camera)) if request.camera.endswith(".toml") else request.camera),
         elevation=_elevation(request, folder, fitting or areas),

@@ -134,8 +134,8 @@ def _change_speed(speed_m_s: float, kind: VehicleKind) -> MissionItem:
 
 
 def _yaw_parameter(yaw_deg: float, autopilot: str) -> float:
-    """Return parameter 4 of a waypoint: ArduPilot ignores it, and its ground stations do not all write a nan."""
-    return 0.0 if autopilot == "ardupilot" else yaw_deg
+    """Return parameter 4 of a waypoint: a nan is PX4's; ArduPilot ignores it, and not all programs read a nan."""
+    return yaw_deg if autopilot == "px4" else 0.0
 
 
 def _navigate(

@@ -234,6 +234,11 @@ def _notes(request: PlanRequest, summary: Any, site: Site) -> list[str]:
         )
     if site.ground.is_flat and request.pattern not in ("facade",):
         notes.append("no terrain model was given: the ground is taken as level with the take-off point")
+    interval = request.flight.camera_interval_s or site.imaging.profile.least_interval_s
+    if interval is None and request.flight.trigger != "hover":
+        notes.append(
+            f"how fast {site.imaging.profile.name} takes images is not known: look whether it can (camera_interval_s)"
+        )
     if asked.side_overlap < 0.5 or asked.forward_overlap < 0.6:
         notes.append("with less than 60 % forward and 50 % side overlap many points are seen in two images only")
     single = request.pattern in ("polygon", "corridor") and not request.terrain.follow
