@@ -391,14 +391,23 @@ def plan(
         "sorties.split_at_items": split or None,
     }
     request = request_of(area, given)
-    if out and survey:
-        raise typer.BadParameter("give --out or --survey, one of them")
-    rest = "" if resume_after is None else f"_after_{resume_after}"
-    folder = out or (survey / f"plan{rest}" if survey else Path(f"{request.name}{rest}"))
+    folder = _plan_folder(request.name, (out, survey), resume_after)
     with progress_shown() as progress:
         made = workflow.plan(request, area.parent, folder, 0 if resume_after is None else resume_after + 1, progress)
     _say(made.lines)
     typer.echo(f"Plan: {folder}\nPage: {made.page}")
+
+
+def _plan_folder(name: str, given: tuple[Path | None, Path | None], resume_after: int | None) -> Path:
+    """Return where a plan goes: the folder or the survey that was given, else a folder of the plan's name.
+
+    The rest of a flight has a folder of its own, so that it does not take the place of the whole.
+    """
+    out, survey = given
+    if out and survey:
+        raise typer.BadParameter("give --out or --survey, one of them")
+    rest = "" if resume_after is None else f"_after_{resume_after}"
+    return out or (survey / f"plan{rest}" if survey else Path(f"{name}{rest}"))
 
 
 def _direction(text: str | None) -> float | str | None:
