@@ -42,7 +42,6 @@ def line(
         start_xy=np.array([east_m, 0.0]),
         direction=np.array([0.0, 1.0]),
         along_m=np.array(along),
-        in_area=np.ones(len(along), np.bool_),
     )
 
 

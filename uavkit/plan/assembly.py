@@ -28,7 +28,7 @@ from uavkit.plan.flight import (
     with_speeds,
 )
 from uavkit.plan.lines import StationLine
-from uavkit.plan.measured import LineMeasures, are_beside, stations_of
+from uavkit.plan.measured import LineMeasures, are_beside, least_and_mean, stations_of
 from uavkit.plan.overlap import points_on_ground
 from uavkit.plan.patterns import LaidSet
 
@@ -405,8 +405,8 @@ def _summary(
         length_m=float(sum(sortie.record.length_m for sortie in sorties)),
         duration_s=float(sum(sortie.record.duration_s for sortie in sorties)),
         gsd_m=(least, float(np.mean(gsd[:, 1])), float(np.max(gsd[:, 2]))),
-        forward_overlap=_least_and_mean(exposures.forward_overlap[sees]),
-        side_overlap=_least_and_mean(exposures.side_overlap[sees]),
+        forward_overlap=least_and_mean(exposures.forward_overlap[sees]),
+        side_overlap=least_and_mean(exposures.side_overlap[sees]),
         height_above_ground_m=(float(above.min()), float(above.mean()), float(above.max())),
         least_clearance_m=clearance_m,
         least_images=0,
@@ -415,11 +415,6 @@ def _summary(
         motion_blur_px=moving * shutter / least if shutter is not None else float("nan"),
         video_motion_px=flies.speed_m_s / frames / video if frames is not None else float("nan"),
     )
-
-
-def _least_and_mean(shares: Array) -> tuple[float, float]:
-    known = shares[~np.isnan(shares)]
-    return (float(known.min()), float(known.mean())) if len(known) else (float("nan"), float("nan"))
 
 
 def _notes(

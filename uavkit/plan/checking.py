@@ -21,7 +21,7 @@ from uavkit.formats.waypoints_file import read_waypoints
 from uavkit.plan.ground import Ground, flat_ground, ground_from_grid
 from uavkit.plan.imaging import Imaging, level_axes
 from uavkit.plan.lines import HeightRule, Mounting, StationLine
-from uavkit.plan.measured import LineMeasures, measure_lines
+from uavkit.plan.measured import LineMeasures, least_and_mean, measure_lines
 from uavkit.plan.mission_exposures import ExpectedExposures, exposures_of
 from uavkit.plan.patterns import LaidSet
 
@@ -241,8 +241,8 @@ def _checked(stations: _Stations, path: Array, ground: Ground, imaging: Imaging)
         images=len(centres),
         strips=len(lines),
         gsd_m=(float(np.nanmin(gsd[:, 0])), float(np.nanmean(gsd[:, 1])), float(np.nanmax(gsd[:, 2]))),
-        forward_overlap=_least_and_mean(np.concatenate([found.forward for found in measures])),
-        side_overlap=_least_and_mean(np.concatenate([found.side for found in measures])),
+        forward_overlap=least_and_mean(np.concatenate([found.forward for found in measures])),
+        side_overlap=least_and_mean(np.concatenate([found.side for found in measures])),
         height_above_ground_m=(float(above.min()), float(above.mean()), float(above.max())),
         least_clearance_m=float(np.min(clearance)),
         worst_place_deg=(float(path[worst, 0]), float(path[worst, 1])),
@@ -265,11 +265,6 @@ def _between_exposures(path_m: Array, lines: list[StationLine]) -> tuple[int, in
     return int(near.min()), int(near.max())
 
 
-def _least_and_mean(shares: Array) -> tuple[float, float]:
-    known = shares[~np.isnan(shares)]
-    return (float(known.min()), float(known.mean())) if len(known) else (float("nan"), float("nan"))
-
-
 def _lines(stations: _Stations, ground: Ground) -> list[StationLine]:
     """Return the strips as lines, those of one direction numbered across it so that neighbours are known."""
     xy = ground.local_map.map_from_geographic(stations.latitude_deg, stations.longitude_deg)
@@ -287,7 +282,6 @@ def _lines(stations: _Stations, ground: Ground) -> list[StationLine]:
                 row=0,
                 centres_m=np.ascontiguousarray(centres[row]),
                 rotations=np.ascontiguousarray(stations.rotations[row]),
-                in_area=np.ones(len(row), np.bool_),
                 base_m=float(np.mean(base)),
                 path_m=centres[row],
                 bends=np.ones(len(row), np.bool_),

@@ -58,8 +58,6 @@ class StationLine:
     """(n, 3)."""
     rotations: Array
     """(n, 3, 3): axes of the set from image."""
-    in_area: Flags
-    """(n,): the line has this station for the ground below it, not only for the overlap of the line beside it."""
     base_m: float
     path_m: Array
     """(k, 3): from the beginning of the lead-in to the end of the lead-out, every station a vertex."""
@@ -93,7 +91,6 @@ class StationLine:
             self,
             centres_m=self.centres_m[first : last + 1],
             rotations=self.rotations[first : last + 1],
-            in_area=self.in_area[first : last + 1],
             path_m=path,
             bends=bends,
             station_vertex=vertices.astype(np.int64),
@@ -108,7 +105,6 @@ class StationLine:
             self,
             centres_m=np.ascontiguousarray(self.centres_m[::-1]),
             rotations=np.ascontiguousarray(self.rotations[::-1] @ half_turn),
-            in_area=self.in_area[::-1],
             path_m=np.ascontiguousarray(self.path_m[::-1]),
             bends=self.bends[::-1],
             station_vertex=last - self.station_vertex[::-1],
@@ -156,7 +152,6 @@ def straight_line(
     start_xy: Array,
     direction: Array,
     along_m: Array,
-    in_area: Flags,
 ) -> StationLine:
     """Return a straight line of stations at distances ``along_m`` (n,), ascending, from a start in a direction (2,)."""
     base = float(np.mean(np.diff(along_m))) if len(along_m) > 1 else 0.0
@@ -182,7 +177,6 @@ def straight_line(
         row=place[2],
         centres_m=np.ascontiguousarray(path[vertices]),
         rotations=np.ascontiguousarray(np.broadcast_to(rotation, (len(along_m), 3, 3))),
-        in_area=in_area,
         base_m=base,
         path_m=path,
         bends=needed,

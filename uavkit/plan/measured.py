@@ -109,12 +109,17 @@ def _measures(looked: _Looked, area: "_PreparedArea") -> LineMeasures:
 
 def are_beside(line: StationLine, other: StationLine) -> bool:
     """Tell whether two lines of neighbouring rows run beside one another somewhere."""
-    step = line.centres_m[-1, :2] - line.centres_m[0, :2]
-    length = float(np.hypot(*step))
-    direction = step / length if length > 0.0 else np.array([0.0, 1.0])
+    direction = _direction(line)
     ours, theirs = line.centres_m[:, :2] @ direction, other.centres_m[:, :2] @ direction
     spare = max(line.base_m, other.base_m)
     return bool(ours.min() - spare <= theirs.max() and theirs.min() - spare <= ours.max())
+
+
+def _direction(line: StationLine) -> Array:
+    """Return the direction of a line, (2,)."""
+    step = line.centres_m[-1, :2] - line.centres_m[0, :2]
+    length = float(np.hypot(*step))
+    return np.asarray(step / length) if length > 0.0 else np.array([0.0, 1.0])
 
 
 def _near(others: list[StationLine], line: StationLine) -> list[StationLine]:
@@ -154,9 +159,7 @@ class _PreparedArea:
 
 def _sides(imaging: Imaging, line: StationLine, points: Array, beside: list[list[StationLine]]) -> Array:
     """Return the shares (sides, n) that the lines of each side show."""
-    step = line.centres_m[-1, :2] - line.centres_m[0, :2]
-    length = float(np.hypot(*step))
-    direction = step / length if length > 0.0 else np.array([0.0, 1.0])
+    direction = _direction(line)
     shares = [side_overlaps(imaging, points, Neighbours.of(direction, lines)) for lines in beside]
     return np.array(shares).reshape(len(shares), len(line))
 
@@ -199,6 +202,12 @@ def covered_shares(coverage: CoverageMap, least: int) -> tuple[int, float, float
     if counts.size == 0:
         return 0, float("nan"), float("nan")
     return int(counts.min()), float(np.mean(counts >= 1)), float(np.mean(counts >= least))
+
+
+def least_and_mean(shares: Array) -> tuple[float, float]:
+    """Return the least and the mean of shares (n,) without nan; nan where there is none."""
+    known = shares[~np.isnan(shares)]
+    return (float(known.min()), float(known.mean())) if len(known) else (float("nan"), float("nan"))
 
 
 def stations_of(lines: Sequence[StationLine]) -> NDArray[np.int64]:

@@ -16,10 +16,10 @@ from uavkit.core.errors import InputError, did_you_mean
 from uavkit.core.flightplan import FlightPlan, Sortie, Trigger, Waypoint, WaypointRole
 from uavkit.core.frames import geoid_undulation_m
 from uavkit.core.mission import Mission, MissionCommand, MissionFrame, MissionItem
-from uavkit.core.vehicle import VehicleKind
+from uavkit.core.vehicle import VehicleKind, VehicleProfile
 from uavkit.plan.mission_exposures import ExpectedExposures, exposures_of
 
-__all__ = ["AUTOPILOTS", "USUAL_AUTOPILOT", "ExpectedExposures", "exposures_of", "item_count", "mission_of"]
+__all__ = ["AUTOPILOTS", "ExpectedExposures", "exposures_of", "flown_with", "item_count", "item_counts", "mission_of"]
 
 AUTOPILOTS = {"ardupilot": 3, "px4": 12, "dji": 0, "other": 0}
 """MAV_AUTOPILOT of each; 0 is a generic one."""
@@ -79,6 +79,16 @@ def item_count(plan: FlightPlan, sortie: int, autopilot: str, kind: VehicleKind 
     """Return how many items a sortie takes in the autopilot's memory; ArduPilot keeps home as one of them."""
     items = sum(1 for _ in _items(plan, _sortie(plan, sortie), autopilot, kind, MissionFrame.TAKE_OFF))
     return items + (1 if autopilot == "ardupilot" else 0)
+
+
+def flown_with(vehicle: VehicleProfile | None) -> tuple[str, VehicleKind]:
+    """Return autopilot and kind of a vehicle, the usual ones where none is named."""
+    return (USUAL_AUTOPILOT, VehicleKind.MULTIROTOR) if vehicle is None else (vehicle.autopilot, vehicle.kind)
+
+
+def item_counts(plan: FlightPlan, vehicle: VehicleProfile | None) -> list[int]:
+    """Return how many items each sortie takes in the autopilot's memory."""
+    return [item_count(plan, sortie, *flown_with(vehicle)) for sortie in range(len(plan.sorties))]
 
 
 def _sortie(plan: FlightPlan, sortie: int) -> Sortie:

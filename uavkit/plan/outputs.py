@@ -17,7 +17,7 @@ from uavkit.formats.plan_tables import write_exposures_csv, write_litchi_csv, wr
 from uavkit.formats.qgc_plan import write_plan
 from uavkit.formats.waypoints_file import write_waypoints
 from uavkit.formats.wpml import write_wpml
-from uavkit.plan.mission import USUAL_AUTOPILOT, item_count, mission_of
+from uavkit.plan.mission import flown_with, item_counts, mission_of
 from uavkit.plan.page import write_plan_page, write_plan_picture
 from uavkit.plan.planner import Planned
 from uavkit.plan.tables import write_summary_json
@@ -65,11 +65,6 @@ def refuse_other_contents(folder: Path) -> None:
         raise InputError(f"{folder}: holds other files than a plan: name a new folder (--out)")
 
 
-def flightplan_in(folder: Path) -> Path | None:
-    """Return the file of the whole plan in a folder, None where there is none."""
-    return next(iter(sorted(folder.glob(f"*{SUFFIX}"))), None)
-
-
 def _write_all(
     folder: Path,
     planned: Planned,
@@ -87,7 +82,7 @@ def _write_all(
         lambda: write_exposures_csv(folder / f"{name}_exposures.csv", plan),
         lambda: write_summary_json(folder / f"{name}_summary.json", planned, request),
         lambda: write_plan_picture(folder / f"{name}.png", planned, request, elevation),
-        lambda: write_plan_page(folder / f"{name}.html", planned, request, elevation, _items(plan, vehicle)),
+        lambda: write_plan_page(folder / f"{name}.html", planned, request, elevation, item_counts(plan, vehicle)),
     )
     for number, write in enumerate(writers, start=1):
         write()
@@ -101,18 +96,10 @@ def _write_all(
     return list(dict.fromkeys(notes))
 
 
-def _items(plan: FlightPlan, vehicle: VehicleProfile | None) -> list[int]:
-    """Return the number of mission items of each sortie."""
-    autopilot = vehicle.autopilot if vehicle is not None else USUAL_AUTOPILOT
-    kind = vehicle.kind if vehicle is not None else VehicleKind.MULTIROTOR
-    return [item_count(plan, number, autopilot, kind) for number in range(len(plan.sorties))]
-
-
 def _write_sortie(
     folder: Path, stem: str, plan: FlightPlan, sortie: int, request: PlanRequest, vehicle: VehicleProfile | None
 ) -> list[str]:
-    autopilot = vehicle.autopilot if vehicle is not None else USUAL_AUTOPILOT
-    kind = vehicle.kind if vehicle is not None else VehicleKind.MULTIROTOR
+    autopilot, kind = flown_with(vehicle)
     mission = mission_of(plan, sortie, autopilot, request.flight.altitude_from, kind)
     write_plan(folder / f"{stem}.plan", mission)
     write_waypoints(folder / f"{stem}.waypoints", mission)

@@ -260,7 +260,6 @@ def _ring(
         row=row,
         centres_m=np.ascontiguousarray(centres),
         rotations=np.ascontiguousarray(upright),
-        in_area=np.ones(count, np.bool_),
         base_m=2.0 * np.pi * radius / count,
         path_m=path,
         bends=np.ones(len(path), np.bool_),

@@ -14,13 +14,13 @@ from uavkit.core.flightplan import CoverageMap, FlightPlan, SurveyArea, TakeOff,
 from uavkit.core.frames import LocalMap
 from uavkit.core.progress import Progress, silent
 from uavkit.core.surface import ElevationGrid
-from uavkit.core.vehicle import VehicleKind, VehicleProfile
+from uavkit.core.vehicle import VehicleProfile
 from uavkit.formats.plan_request import PlanRequest, check_request
 from uavkit.plan import checks
 from uavkit.plan.assembly import Assembled, assemble, most_items
 from uavkit.plan.flight import Airfield, Performance
 from uavkit.plan.layout import Laid, coverage_of, laid_well, least_of, shortfall
-from uavkit.plan.mission import USUAL_AUTOPILOT, item_count
+from uavkit.plan.mission import item_counts
 from uavkit.plan.patterns import (
     LaidSet,
 )
@@ -82,7 +82,7 @@ def plan_survey(
             first_station,
         )
         planned = _planned(site, laid, done, vehicle, [note] if note else [])
-        longest = _longest_mission(planned.plan, vehicle)
+        longest = max(item_counts(planned.plan, vehicle))
         if longest <= most:
             return planned
         if not request.sorties.split_at_items or aimed < 30:
@@ -194,13 +194,6 @@ def _covered_m2(site: Site, laid: Laid) -> float:
     """Return the size of what is to be covered: ground, or the faces themselves."""
     shapes = [found.area for found in laid.sets] if site.request.pattern == "facade" else site.covered
     return float(sum(shape.area for shape in shapes))
-
-
-def _longest_mission(plan: FlightPlan, vehicle: VehicleProfile | None) -> int:
-    """Return the number of mission items of the sortie that has most."""
-    autopilot = vehicle.autopilot if vehicle is not None else USUAL_AUTOPILOT
-    kind = vehicle.kind if vehicle is not None else VehicleKind.MULTIROTOR
-    return max(item_count(plan, number, autopilot, kind) for number in range(len(plan.sorties)))
 
 
 def _too_many_items(plan: FlightPlan, needed: int, most: int) -> InputError:

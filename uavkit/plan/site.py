@@ -48,11 +48,6 @@ class Site:
     home_xy: Array | None
     progress: Progress
 
-    @property
-    def footprint_m(self) -> float:
-        """Return the longer side of what an image shows on flat ground."""
-        return max(self.imaging.length_m(self.height_m), self.imaging.width_m(self.height_m))
-
 
 def site_of(
     request: PlanRequest,

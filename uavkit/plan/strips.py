@@ -156,7 +156,7 @@ class _Layout:
 
     def _probe(self, row: float, intervals: list[Interval]) -> list[tuple[StationLine, Array]]:
         """Return lines of a row with stations and their ground points, for the comparison with another row."""
-        return [self._line(row, interval, []) for interval in intervals]
+        return [self._line(row, interval) for interval in intervals]
 
     def _least_side(self, here: list[tuple[StationLine, Array]], there: list[tuple[StationLine, Array]]) -> float:
         least = np.nan
@@ -211,11 +211,11 @@ class _Layout:
         for number, row in enumerate(rows):
             around = [interval for other in own[max(0, number - 1) : number + 2] for interval in other]
             for interval in self._merged(around):
-                line, _ = self._line(row, interval, own[number])
+                line, _ = self._line(row, interval)
                 result.append(replace(line, row=number))
         return result
 
-    def _line(self, row: float, interval: Interval, own: list[Interval]) -> tuple[StationLine, Array]:
+    def _line(self, row: float, interval: Interval) -> tuple[StationLine, Array]:
         """Return a line over an interval of u, its base short enough for the forward overlap, and its ground points.
 
         Where the vehicle stops for every image the base changes along the line, else the shortest one serves it all.
@@ -224,7 +224,7 @@ class _Layout:
         longest = min(self.base_m, self.base_of_row.get(row, LONGER * self.last_base_m))
         along = self._evenly(interval, longest)
         for turn in range(ROUNDS):
-            line = self._stations(row, along, own)
+            line = self._stations(row, along)
             points = self._points(line)
             if not ask.keep_overlap or len(line) < 2:
                 return line, points
@@ -280,17 +280,13 @@ class _Layout:
         refuse_too_many(count, self.strips.area)
         return np.linspace(first, first + length, count)
 
-    def _stations(self, row: float, along: Array, own: list[Interval]) -> StationLine:
-        in_area = np.zeros(len(along), np.bool_)
-        for begin, end in own:
-            in_area |= (along >= begin - 1e-6) & (along <= end + 1e-6)
+    def _stations(self, row: float, along: Array) -> StationLine:
         return straight_line(
             self.strips.mounting,
             place=(self.strips.area, self.strips.set_number, 0),
             start_xy=self.map_xy(0.0, row),
             direction=self.strips.along,
             along_m=along,
-            in_area=in_area,
         )
 
 
