@@ -149,6 +149,17 @@ def test_flight_that_begins_above_its_take_off_point_takes_off_first(trigger: st
     assert commands.index(MissionCommand.DO_MOUNT_CONTROL) < first_picture
 
 
+@pytest.mark.parametrize("trigger", ["hover", "distance"])
+def test_steep_ground_brings_strips_and_exposures_closer(trigger: str) -> None:
+    """Where the ground falls away to the side the next strip shows less of an image than over level ground."""
+    asked = request(terrain={"file": "x", "follow": True}, flight={"trigger": trigger}, imaging={"direction_deg": 30.0})
+    level = plan_survey(asked.model_copy(update={"terrain": request().terrain}), (area(SQUARE),), CAMERA).plan
+    steep = plan_survey(asked, (area(SQUARE),), CAMERA, hills(height_m=22.0)).plan
+    assert steep.summary.side_overlap[0] >= 0.59
+    assert steep.summary.forward_overlap[0] >= 0.79
+    assert len(steep.strips) > len(level.strips)
+
+
 def test_several_areas_are_one_plan() -> None:
     other = area([(400.0, 0.0), (480.0, 0.0), (480.0, 90.0), (400.0, 90.0)], name="second")
     plan = plan_survey(request(), (area(SQUARE), other), CAMERA).plan
