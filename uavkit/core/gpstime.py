@@ -2,8 +2,16 @@
 
 from datetime import UTC, datetime, timedelta
 
+import numpy as np
+
+from uavkit.core.arrays import Indices
+
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 WEEK_NS = 7 * 86_400 * 1_000_000_000
+NO_TIME = int(np.iinfo(np.int64).min)
+"""Marks an unknown time in a table's column of nanoseconds."""
+UNIX_EPOCH_NS = 315_964_800 * 1_000_000_000
+"""1980-01-06 in Unix time."""
 
 _LEAP_DATES = (
     "1981-07-01 1982-07-01 1983-07-01 1985-07-01 1988-01-01 1990-01-01 1991-01-01 1992-07-01 1993-07-01 "
@@ -39,3 +47,22 @@ def utc_from_gps_time_ns(gps_time_ns: int) -> datetime:
 def gps_time_ns_from_week(week: int, time_of_week_ns: int) -> int:
     """Return the GPS time of a full week number (not modulo 1024) and a time of week in nanoseconds."""
     return week * WEEK_NS + time_of_week_ns
+
+
+_LEAP_GPS_NS = np.array([gps_time_ns_from_utc(date) for date in LEAP_SECOND_DATES], dtype=np.int64)
+"""GPS time of the first instant after each leap second."""
+
+
+def gps_times_ns_from_unix_ns(unix_ns: Indices) -> Indices:
+    """Return GPS times of Unix times (UTC without leap seconds), both integer ns of any shape; NO_TIME stays."""
+    unix = np.asarray(unix_ns, dtype=np.int64)
+    unknown = unix == NO_TIME
+    since = np.where(unknown, 0, unix) - UNIX_EPOCH_NS
+    dates = _LEAP_GPS_NS - np.arange(1, len(_LEAP_GPS_NS) + 1) * 1_000_000_000
+    leap = np.searchsorted(dates, since, side="right") * 1_000_000_000
+    return np.where(unknown, NO_TIME, since + leap)
+
+
+def leap_seconds_at(gps_time_ns: int) -> int:
+    """Return GPS time minus UTC in whole seconds at an instant in GPS time."""
+    return int(np.searchsorted(_LEAP_GPS_NS, gps_time_ns, side="right"))

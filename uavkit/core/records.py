@@ -44,9 +44,12 @@ class AttitudeSample:
 class ExposureEvent:
     """An exposure as something other than the camera noticed it: trigger, feedback pin, shutter seen in the video."""
 
-    gps_time_ns: int
+    gps_time_ns: int | None
+    """None where the source knows no time (waypoint lists)."""
     sequence: int | None = None
     source: str = ""
+    position: GnssFix | None = None
+    """Where the source says it was; of the vehicle or the antenna, not of the camera."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,0 +1,1 @@
+"""Inner loops over the bytes of logs, on bare arrays."""

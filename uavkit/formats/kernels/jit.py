@@ -1,0 +1,13 @@
+"""Compilation of inner loops."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def kernel(function: Function) -> Function:
+    """Compile an inner loop on bare arrays, once for this machine."""
+    return cast(Function, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
