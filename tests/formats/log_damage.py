@@ -14,7 +14,7 @@ class Damaged:
     data: bytes
     kind: str
     intact: tuple[tuple[int, int, int], ...]
-    """Spans (begin, end, offset): bytes begin to end of the intact log stand, unchanged, ``offset`` bytes further on."""
+    """Spans (begin, end, offset): the bytes begin to end of the intact log stand, unchanged, ``offset`` further on."""
 
     def moved(self, begin: int, end: int) -> int | None:
         """Return where in the damaged log a message of the intact one begins, None where damage touched it."""
@@ -37,7 +37,7 @@ def damaged(data: bytes, rng: np.random.Generator, longest: int = 400) -> Damage
         return Damaged(data=before + bytes(end - begin) + after, kind=kind, intact=((0, begin, 0), (end, len(data), 0)))
     if kind == "repeated":
         return Damaged(
-            data=before + span + span + after, kind=kind, intact=((0, end, 0), (end, len(data), end - begin))
+            data=before + span + span + after, kind=kind, intact=((0, end, 0), (begin, len(data), end - begin))
         )
     place = int(rng.integers(begin, end))
     flipped = bytearray(data)
