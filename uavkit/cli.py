@@ -304,6 +304,44 @@ def export(
         typer.echo(str(path))
 
 
+log = typer.Typer(no_args_is_help=True, help="Flight logs: what is in one, and its contents for other programs.")
+app.add_typer(log, name="log")
+
+
+@log.command("info")
+def log_info(
+    file: Annotated[
+        Path, typer.Argument(help="A flight log of any kind; its content tells which.", show_default=False)
+    ],
+    as_json: Annotated[bool, typer.Option("--json", help="As JSON, for programs.")] = False,
+) -> None:
+    """Tell what is in a log: kind, time span, clock, positions, exposures, messages, damage."""
+    import json
+
+    from uavkit import workflow
+    from uavkit.formats.log_summary import log_summary, summary_lines
+
+    with progress_shown() as progress:
+        found = workflow.flight_log(file, progress)
+    _say([json.dumps(log_summary(found), indent=2, allow_nan=False)] if as_json else summary_lines(found))
+
+
+@log.command("export")
+def log_export(
+    file: Annotated[Path, typer.Argument(help="A flight log of any kind.", show_default=False)],
+    to: Annotated[Literal["csv", "kml", "gpx", "parquet"], typer.Option(help="Format.", show_default=False)],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write to; else a new one beside you, named after the log.")
+    ] = None,
+) -> None:
+    """Write positions, attitudes and exposures of a log for other programs."""
+    from uavkit import workflow
+
+    with progress_shown() as progress:
+        written = workflow.export_log(file, to, out or Path(file.stem), progress)
+    _say([str(path) for path in written])
+
+
 @app.command()
 def cameras() -> None:
     """List the cameras that are known."""

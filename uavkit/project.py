@@ -65,6 +65,16 @@ class IngestOptions(_Strict):
     """Horizontal system of the control file and of the results; empty: that of the control file, else UTM."""
     pixel_origin: Literal["", "centre", "corner"] = ""
     """Which point of the upper left pixel is (0, 0) in marks; empty: what the control file says."""
+    lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """From the camera to the GNSS antenna in the vehicle's axes: forward, right, down."""
+    shutter_latency_s: float = 0.0
+    """From an exposure event of a log to the exposure."""
+    latency_sigma_s: float = 0.1
+    """How far the latency may be off; the adjustment estimates the rest. 0 holds it."""
+
+
+Role = Literal["images", "video", "positions", "log", "plan", "match", "control_points", "check_points", "camera"]
+"""What an original is to a survey."""
 
 
 class Manifest(_Strict):
@@ -72,7 +82,8 @@ class Manifest(_Strict):
 
     uavkit_survey: Literal[1] = 1
     """Version of this file's format."""
-    originals: dict[Literal["images", "video", "positions", "control_points", "check_points", "camera"], Original]
+    originals: dict[Role, Original | tuple[Original, ...]]
+    """Several files of one role in the order in which they were given."""
     ingest: IngestOptions
     process: tuple[str, ...] = ()
     """Settings ``section.option=value`` that differ from the defaults."""
@@ -154,11 +165,23 @@ class Project:
     def original_path(self, role: str) -> Path | None:
         """Return where an original lies now, None where the survey has none of this role.
 
-        Raises InputError where it is neither at its old place nor at the same place as seen from the survey.
+        Raises InputError where it is gone, or where the role has several.
         """
-        entry = {str(name): value for name, value in self.manifest.originals.items()}.get(role)
-        if entry is None:
-            return None
+        paths = self.original_paths(role)
+        if len(paths) > 1:
+            raise InputError(f"{self.folder}: one file as {role.replace('_', ' ')}, not {len(paths)}")
+        return paths[0] if paths else None
+
+    def original_paths(self, role: str) -> tuple[Path, ...]:
+        """Return where the originals of a role lie now, none where the survey has none.
+
+        Raises InputError where one is neither at its old place nor at the same place as seen from the survey.
+        """
+        known = {str(name): value for name, value in self.manifest.originals.items()}.get(role, ())
+        entries = (known,) if isinstance(known, Original) else known
+        return tuple(self._place_of(entry, role) for entry in entries)
+
+    def _place_of(self, entry: Original, role: str) -> Path:
         places = [Path(entry.absolute)] + ([self.folder / entry.relative] if entry.relative else [])
         for place in places:
             if place.exists():
@@ -319,9 +342,10 @@ class Project:
             roles = [role for role in roles if role in ("images", "video")]
         files: dict[str, Path] = {}
         for role in roles:
-            place = self.original_path(role)
-            if place is not None:
-                files |= {f"{role}: {path.name}": path for path in _files(place)}
+            for place in self.original_paths(role):
+                for path in _files(place):
+                    name = f"{role}: {path.name}"
+                    files[name if name not in files else f"{role}: {path.parent.name}/{path.name}"] = path
         if stage is Stage.PROCESS:
             files |= {self._name(path): path for path in self._files_of(Stage.INGEST)}
         return files

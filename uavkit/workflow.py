@@ -25,6 +25,7 @@ from uavkit.formats.video import FileVideoSource
 from uavkit.project import IngestOptions, Manifest, Original, Project, Stage, Standing
 
 if TYPE_CHECKING:
+    from uavkit.core.flight_log import FlightLog
     from uavkit.core.vehicle import VehicleProfile
     from uavkit.formats.plan_request import PlanRequest, TerrainRequest
 
@@ -115,11 +116,30 @@ def vehicles() -> list["VehicleProfile"]:
     return [load_vehicle(name) for name in list_vehicles()]
 
 
-def begin_survey(project: Project, originals: Mapping[str, Path], options: IngestOptions) -> None:
+def flight_log(path: Path, progress: Progress = silent) -> "FlightLog":
+    """Return what a flight log of any kind holds."""
+    from uavkit.formats.flight_logs import open_log
+
+    return open_log(path, progress)
+
+
+def export_log(path: Path, target: str, folder: Path, progress: Progress = silent) -> list[Path]:
+    """Write the contents of a flight log into a folder for other programs, and return the files."""
+    from uavkit.formats.flight_logs import open_log
+    from uavkit.formats.log_export import export_log as write_log
+
+    return write_log(open_log(path, progress), folder, target)
+
+
+def begin_survey(project: Project, originals: Mapping[str, Path | Sequence[Path]], options: IngestOptions) -> None:
     """Write the manifest of a survey, new or again; settings of process that it has are kept."""
-    found: dict[Any, Original] = {role: project.original(path) for role, path in originals.items()}
+    found: dict[Any, Original | tuple[Original, ...]] = {
+        role: project.original(given) if isinstance(given, Path) else tuple(map(project.original, given))
+        for role, given in originals.items()
+    }
     known = project.manifest.process if (project.folder / "manifest.json").is_file() else ()
-    label = _simulation_label(originals["images"])
+    images = originals["images"]
+    label = _simulation_label(images) if isinstance(images, Path) else {}
     project.save_manifest(Manifest(originals=found, ingest=options, process=known, **label))
 
 
