@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from uavkit.core.camera import CameraProfile, InteriorOrientation
 from uavkit.core.errors import InputError
+from uavkit.core.exposures import ExposureMatches
 from uavkit.core.frames import LocalFrame
 from uavkit.core.observations import GnssObservations
 from uavkit.core.points import CheckPoint, ControlPoint
@@ -59,6 +60,8 @@ class Block:
     control_points: tuple[ControlPoint, ...] = ()
     check_points: tuple[CheckPoint, ...] = ()
     video: VideoSync | None = None
+    exposures: ExposureMatches | None = None
+    """None where no log tells of exposures."""
     notes: tuple[str, ...] = ()
     """Degradations and decisions of ingest, in words, for the report."""
 

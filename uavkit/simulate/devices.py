@@ -19,13 +19,11 @@ from uavkit.core.records import ExposureEvent, GnssFix, StillInfo, VideoFrame, V
 from uavkit.simulate.camera import FOCAL_LENGTH_MM
 from uavkit.simulate.options import VideoStandard
 from uavkit.simulate.positions import fixes_at
+from uavkit.simulate.receiver_log import FEEDBACK_LATENCY_S
 from uavkit.simulate.site import gps_time_ns
 from uavkit.simulate.stills import render_still
 from uavkit.simulate.survey import Scene, make_scene
 from uavkit.simulate.video import HEIGHT_PX, WIDTH_PX
-
-FEEDBACK_LATENCY_S = 0.0008
-"""From the shutter to the time stamp of its feedback pin."""
 
 
 class SimulatedStills:

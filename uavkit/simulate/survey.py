@@ -23,6 +23,7 @@ from uavkit.simulate.control import TruePoint, choose_points, observe_points, su
 from uavkit.simulate.flight import Flight, make_flight
 from uavkit.simulate.options import SimulationOptions, VideoStandard
 from uavkit.simulate.positions import RTK_SIGMA_M, WaypointPositions, measure_waypoints
+from uavkit.simulate.receiver_log import write_receiver_log
 from uavkit.simulate.site import CAMERA_ZONE_HOURS, VIDEO_START_UTC
 from uavkit.simulate.stills import StillSettings, render_still, write_still
 from uavkit.simulate.video import Finder, make_finder, write_video
@@ -42,6 +43,8 @@ class SimulatedSurvey:
     """Waypoints, without sigmas."""
     image_positions: Path
     """The same positions by image, with their sigmas."""
+    receiver_log: Path
+    """What the receiver on board recorded: its fixes, and the marks of the shutter."""
     control_points: Path | None
     """None where there are no control points, as for the next two."""
     check_points: Path | None
@@ -129,6 +132,7 @@ def simulate_survey(out: Path, options: SimulationOptions, progress: Progress = 
     _refuse_another_survey(paths, scene.names)
     write_positions(paths.positions, "Waypoints", scene.waypoints.fixes())
     write_image_positions(paths.image_positions, scene.waypoints.of_images(scene.names, options.gnss_sigma_m))
+    write_receiver_log(paths.receiver_log, scene.flight, scene.waypoints.shift_m, options)
     _write_points(paths, scene)
     truth.write_truth(paths.truth, truth_of(scene))
     _write_field_poses(out / "truth" / "field_poses.npz", scene.flight)
@@ -169,6 +173,7 @@ def _paths(out: Path, options: SimulationOptions) -> SimulatedSurvey:
         video=None if options.video_standard is VideoStandard.NONE else out / "video.avi",
         positions=out / "positions.kml",
         image_positions=out / "positions.csv",
+        receiver_log=out / "gnss.ubx",
         control_points=out / "control_points.csv" if options.control_points else None,
         check_points=out / "check_points.csv" if options.check_points else None,
         gcp_list=out / "gcp_list.txt" if options.control_points else None,
@@ -246,6 +251,7 @@ def _readme(scene: Scene) -> str:
         (paths.video, f"the finder's video, interlaced, {options.field_order.value} field first"),
         (paths.positions, f"positions of the waypoints, one for each still, from the receiver on board ({quality})"),
         (paths.image_positions, "the same by image, with the sigma of each"),
+        (paths.receiver_log, "what that receiver recorded: five fixes a second, and a mark for each shutter"),
         (paths.control_points, f"{control}, sigma {1000 * options.control_sigma_m:g} mm"),
         (paths.check_points, f"{len(scene.check)} check points: held back, to judge the result"),
         (paths.gcp_list, "the control points in OpenDroneMap's form"),
@@ -265,4 +271,6 @@ Process it with
 
     uavkit ingest SURVEY {command}
     uavkit run SURVEY
+
+or with --log {paths.receiver_log} instead of --positions: then the stills are matched with the marks of the shutter.
 """
