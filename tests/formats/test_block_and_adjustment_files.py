@@ -163,6 +163,7 @@ def test_adjustment_json_holds_the_figures(tmp_path: Path) -> None:
     assert content["candidates"] == {"video": {"found": 40, "survived": 10}}
     # four positions, three of oriented images, of which the second (s2) was rejected
     assert content["gnss_rejected"] == ["s2.jpg"]
+    assert (content["gnss_latency_s"], content["gnss_latency_sigma_s"]) == ([], [])
     interior = content["interior_orientation"]
     assert interior["values"]["principal_distance_px"] == 900.0
     assert interior["sigmas"]["b1"] is None

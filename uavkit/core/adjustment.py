@@ -107,11 +107,15 @@ class AdjustmentResult:
     gnss_used: Flags
     """(g,)."""
     gnss_residuals_m: Array
-    """(g, 3) observed minus adjusted, after the shift."""
+    """(g, 3) observed minus adjusted, after shift and latency."""
     gnss_shift_m: Array
     """(flights, 3)."""
     gnss_shift_covariance_m2: Array
     """(flights, 3, 3)."""
+    gnss_latency_s: Array = field(default_factory=lambda: np.zeros(0))
+    """(flights,) see ``GnssObservations``; empty where no latency was estimated."""
+    gnss_latency_sigma_s: Array = field(default_factory=lambda: np.zeros(0))
+    """(flights,)."""
     control_used: Flags
     """(c,)."""
     control_residuals_m: Array

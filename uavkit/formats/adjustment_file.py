@@ -163,6 +163,8 @@ def _gnss(oriented: OrientedBlock) -> dict[str, Any]:
         "gnss_rejected": _rejected_images(oriented),
         "gnss_shift_m": result.gnss_shift_m.tolist(),
         "gnss_shift_sigma_m": sigma.tolist(),
+        "gnss_latency_s": result.gnss_latency_s.tolist(),
+        "gnss_latency_sigma_s": result.gnss_latency_sigma_s.tolist(),
     }
 
 

@@ -174,6 +174,16 @@ def _unsorted(system: BundleSystem, values: Values) -> Values:
     return result
 
 
+def _notes_on_latency(system: BundleSystem, sigma_s: Array) -> tuple[str, ...]:
+    """Return in words which flights do not determine their latency."""
+    return tuple(
+        f"the latency of the positions of flight {flight + 1} is not determined (sigma {after:.2g} s, a priori "
+        f"{before:.2g} s): velocities must vary, as on strips flown to and fro"
+        for flight, (after, before) in enumerate(zip(sigma_s, system.latency_sigma_s, strict=True))
+        if after > UNDETERMINED_SHARE * before
+    )
+
+
 def _result(system: BundleSystem, state: State, weights: Weights, precision: Precision, run: _Run) -> AdjustmentResult:
     determined, given = precision.determined, system.given
     used = used_rays(system, weights, determined)
@@ -189,8 +199,9 @@ def _result(system: BundleSystem, state: State, weights: Weights, precision: Pre
     cut = cut_variance(run.options.reject_above) if run.options.robust else 1.0
     interiors = interior_covariances(system, precision)
     sigmas, prior = np.sqrt(np.einsum("gkk->gk", interiors)).max(axis=0), given.interior_sigmas.values()
-    q = system.shared
-    shift_covariance = precision.inverse.corner[q:, q:].reshape(len(state.shifts), 3, len(state.shifts), 3)
+    q, last = system.shared, system.first_latency
+    shift_covariance = precision.inverse.corner[q:last, q:last].reshape(len(state.shifts), 3, len(state.shifts), 3)
+    latency_sigma_s = np.sqrt(np.diag(precision.inverse.corner)[last:])
     return AdjustmentResult(
         interior=given.interior.with_parameters(state.interior[0]),
         interior_covariance=interiors[0],
@@ -216,6 +227,8 @@ def _result(system: BundleSystem, state: State, weights: Weights, precision: Pre
         gnss_residuals_m=found.gnss_m,
         gnss_shift_m=state.shifts,
         gnss_shift_covariance_m2=np.einsum("fafb->fab", shift_covariance),
+        gnss_latency_s=state.latencies,
+        gnss_latency_sigma_s=latency_sigma_s,
         control_used=weights.control > 0.0,
         control_residuals_m=found.control_m,
         sigma0=float(np.sqrt(square_sum / redundancy / cut)),
@@ -225,6 +238,6 @@ def _result(system: BundleSystem, state: State, weights: Weights, precision: Pre
         iterations=run.iterations,
         converged=run.converged,
         joint_points=run.joint_points,
-        notes=run.notes,
+        notes=run.notes + _notes_on_latency(system, latency_sigma_s),
         joint_covariance_m2=joint_covariance(system, state, weights, precision.factor, run.joint_points),
     )

@@ -61,6 +61,9 @@ class State:
     rotations: Array
     points: Array
     shifts: Array
+    """(flights, 3) of GNSS positions."""
+    latencies: Array
+    """(flights,) of GNSS positions, in seconds; empty where none is unknown."""
 
     @property
     def unknowns(self) -> Unknowns:
@@ -132,6 +135,8 @@ class BundleSystem:
     """(q,)."""
     shift_sigma_m: Array
     """(flights, 3) a priori sigma; infinite where free."""
+    latency_sigma_s: Array
+    """(flights,) a priori sigma; empty where there is no such unknown."""
     factorise: Factoriser = factor_dense
     anchor: Anchor | None = None
 
@@ -149,13 +154,23 @@ class BundleSystem:
 
     @property
     def shared(self) -> int:
-        """Return the number of border unknowns that belong to interior orientations; GNSS shifts follow them."""
+        """Return the number of border unknowns of interior orientations; GNSS shifts, then latencies follow."""
         return len(self.free.shared) * len(self.interior)
 
     @property
     def border(self) -> int:
         """Return the number of border unknowns."""
+        return self.shared + self.shift_sigma_m.size + self.latency_sigma_s.size
+
+    @property
+    def first_latency(self) -> int:
+        """Return the place of the first latency among the border unknowns."""
         return self.shared + self.shift_sigma_m.size
+
+    @property
+    def gnss_prior_sigma(self) -> Array:
+        """Return the a priori sigmas of shifts, then latencies."""
+        return np.concatenate([self.shift_sigma_m.ravel(), self.latency_sigma_s])
 
     @property
     def uses_gnss(self) -> bool:
@@ -177,6 +192,7 @@ class BundleSystem:
             rotations=np.array(given.R_object_from_image, dtype=np.float64),
             points=np.array(given.points_m, dtype=np.float64),
             shifts=np.zeros_like(self.shift_sigma_m),
+            latencies=np.zeros_like(self.latency_sigma_s),
         )
 
     def full_weights(self) -> Weights:
@@ -222,6 +238,7 @@ def build_system(
         prior=prior[:, parameters],
         prior_sigma=sigmas[parameters],
         shift_sigma_m=_shift_sigmas(given, datum, default_shift_sigma_m),
+        latency_sigma_s=_latency_sigmas(given, datum),
         factorise=choose_factoriser(pattern, given.projection_centres_m),
     )
 
@@ -243,6 +260,14 @@ def _shift_sigmas(given: AdjustmentInput, datum: Datum, default: tuple[float, fl
     if stated is None:
         stated = (np.inf,) * 3 if datum is Datum.CONTROL else default
     return np.tile(np.asarray(stated, dtype=np.float64), (flights, 1))
+
+
+def _latency_sigmas(given: AdjustmentInput, datum: Datum) -> Array:
+    """Return the a priori sigmas of the GNSS latencies, (flights,); empty where none is asked for."""
+    gnss = given.gnss
+    if gnss is None or len(gnss) == 0 or datum is Datum.FREE_NETWORK or gnss.latency_sigma_s is None:
+        return np.zeros(0)
+    return np.full(int(np.max(gnss.flight)) + 1, gnss.latency_sigma_s)
 
 
 def in_chunks(system: BundleSystem, work: Callable[[int, int], T]) -> Iterable[T]:
@@ -275,7 +300,18 @@ def _gnss_misclosures(system: BundleSystem, state: State) -> Array:
     i = gnss.image_index
     antenna = state.centres[i] + state.rotations[i] @ np.asarray(gnss.lever_arm_m)
     shift = state.shifts[gnss.flight] if len(state.shifts) else 0.0
-    return np.asarray(gnss.position_m - antenna - shift)
+    misclosure = np.asarray(gnss.position_m - antenna - shift)
+    if len(state.latencies):
+        misclosure -= _velocities(system) * state.latencies[gnss.flight][:, None]
+    return misclosure
+
+
+def _velocities(system: BundleSystem) -> Array:
+    """Return the derivatives (g, 3) of antenna positions by their latency; none where it is no unknown."""
+    gnss = system.given.gnss
+    if gnss is None or gnss.velocity_m_s is None or len(system.latency_sigma_s) == 0:
+        return np.zeros((0, 3))
+    return gnss.velocity_m_s
 
 
 def _control(system: BundleSystem, state: State) -> Array:
@@ -301,6 +337,7 @@ def cost(system: BundleSystem, state: State, weights: Weights, determined: Flags
     total += float(np.sum(((state.interior[:, system.parameters] - system.prior) / system.prior_sigma) ** 2))
     if system.anchor is not None:
         total += float(np.sum(system.anchor.misclosures(state) ** 2))
+    total += float(np.sum((state.latencies / system.latency_sigma_s) ** 2))
     return total + float(np.sum((state.shifts / system.shift_sigma_m) ** 2))
 
 
@@ -337,6 +374,26 @@ def _add_gnss(system: BundleSystem, state: State, weights: Weights, reduced: Red
         np.add.at(reduced.corner, (column, column), p[:, axis])
         np.add.at(reduced.diagonal_border, column, p[:, axis])
         np.add.at(reduced.right_border, column, p[:, axis] * misclosure[:, axis])
+    if len(state.latencies):
+        _add_latency(system, weighted, p, misclosure, reduced)
+
+
+def _add_latency(system: BundleSystem, weighted: Array, p: Array, misclosure: Array, reduced: Reduced) -> None:
+    """Add the part of the latencies; ``weighted`` (g, 3, 6) is the design by image times the weights p (g, 3)."""
+    gnss = system.given.gnss
+    assert gnss is not None
+    velocity, column = _velocities(system), system.first_latency + gnss.flight
+    weighted_velocity = p * velocity
+    squares = np.sum(weighted_velocity * velocity, axis=1)
+    by_flight = reduced.border[:, :6].transpose(0, 2, 1)
+    np.add.at(by_flight, (gnss.image_index, column), np.einsum("gak,ga->gk", weighted, velocity))
+    np.add.at(reduced.corner, (column, column), squares)
+    np.add.at(reduced.diagonal_border, column, squares)
+    np.add.at(reduced.right_border, column, np.sum(weighted_velocity * misclosure, axis=1))
+    for axis in range(3):
+        shift = system.shared + 3 * gnss.flight + axis
+        np.add.at(reduced.corner, (shift, column), weighted_velocity[:, axis])
+        np.add.at(reduced.corner, (column, shift), weighted_velocity[:, axis])
 
 
 def gnss_design(system: BundleSystem, state: State) -> Array:
@@ -348,7 +405,7 @@ def gnss_design(system: BundleSystem, state: State) -> Array:
 
 
 def _add_priors(system: BundleSystem, state: State, reduced: Reduced) -> None:
-    """Add a priori observations of interior orientation and GNSS shifts."""
+    """Add a priori observations of interior orientation, GNSS shifts and latencies."""
     information, value = border_priors(system, state)
     reduced.corner[np.diag_indices_from(reduced.corner)] += information
     reduced.diagonal_border[:] += information
@@ -368,9 +425,9 @@ def _add_priors(system: BundleSystem, state: State, reduced: Reduced) -> None:
 def border_priors(system: BundleSystem, state: State) -> tuple[Array, Array]:
     """Return a priori weights of the border unknowns and how far each is from its a priori value, (b,)."""
     shared = len(system.interior) if len(system.free.shared) else 0
-    sigma = np.concatenate([np.tile(system.prior_sigma, shared), system.shift_sigma_m.ravel()])
+    sigma = np.concatenate([np.tile(system.prior_sigma, shared), system.gnss_prior_sigma])
     value = (state.interior[:, system.parameters] - system.prior)[:shared].ravel()
-    return sigma**-2.0, np.concatenate([value, state.shifts.ravel()])
+    return sigma**-2.0, np.concatenate([value, state.shifts.ravel(), state.latencies])
 
 
 def reduced_normals(system: BundleSystem, state: State, weights: Weights, damping: float) -> tuple[Reduced, Flags]:
@@ -531,7 +588,7 @@ def _solve(
 
 def moved(system: BundleSystem, state: State, change: Change, share: float) -> State:
     """Return a state moved by a share of a change."""
-    q, interior = system.shared, state.interior.copy()
+    q, last, interior = system.shared, system.first_latency, state.interior.copy()
     if q:
         interior[:, system.parameters] += share * change.border[:q].reshape(len(interior), -1)
     if len(system.free.own):
@@ -542,7 +599,8 @@ def moved(system: BundleSystem, state: State, change: Change, share: float) -> S
         centres=state.centres + share * change.images[:, :3],
         rotations=state.rotations @ rotation_from_vector(share * change.images[:, 3:6]),
         points=state.points + share * change.points,
-        shifts=state.shifts + share * change.border[q:].reshape(-1, 3),
+        shifts=state.shifts + share * change.border[q:last].reshape(-1, 3),
+        latencies=state.latencies + share * change.border[last:],
     )
 
 
@@ -559,7 +617,9 @@ def _direct_product(system: BundleSystem, state: State, weights: Weights, images
     if system.uses_gnss and system.given.gnss is not None:
         gnss = system.given.gnss
         moved = np.einsum("gak,gk->ga", gnss_design(system, state), images[gnss.image_index, :6])
-        moved += border[q:].reshape(-1, 3)[gnss.flight]
+        moved += border[q : system.first_latency].reshape(-1, 3)[gnss.flight]
+        if len(state.latencies):
+            moved += _velocities(system) * border[system.first_latency :][gnss.flight][:, None]
         p = weights.gnss[:, None] / gnss.sigma_m**2
         total += float(np.sum(p * moved * _gnss_misclosures(system, state)))
     return total
@@ -641,7 +701,21 @@ def _gnss_leverage(system: BundleSystem, state: State, inverse: Inverse) -> Arra
         column = system.shared + 3 * gnss.flight + axis
         variance[:, axis] += 2.0 * np.einsum("gk,gk->g", design[:, axis], inverse.border[i, :6, column])
         variance[:, axis] += inverse.corner[column, column]
+    if len(state.latencies):
+        variance += _latency_variance(system, design, inverse)
     return np.asarray(variance / gnss.sigma_m**2)
+
+
+def _latency_variance(system: BundleSystem, design: Array, inverse: Inverse) -> Array:
+    """Return the part (g, 3) of the variance of adjusted antenna positions that the latencies make."""
+    gnss, velocity = system.given.gnss, _velocities(system)
+    assert gnss is not None
+    column = system.first_latency + gnss.flight
+    with_image = np.einsum("gak,gk->ga", design, inverse.border[gnss.image_index, :6, column])
+    shift = system.shared + 3 * gnss.flight[:, None] + np.arange(3)
+    with_shift = inverse.corner[shift, column[:, None]]
+    own = inverse.corner[column, column][:, None]
+    return np.asarray(2.0 * velocity * (with_image + with_shift) + velocity**2 * own)
 
 
 def _control_leverage(system: BundleSystem, covariances: Array) -> Array:

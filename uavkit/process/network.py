@@ -279,6 +279,8 @@ def _gnss(block: Block, images: Indices) -> GnssObservations | None:
         flight=gnss.flight[keep],
         lever_arm_m=gnss.lever_arm_m,
         shift_sigma_m=gnss.shift_sigma_m,
+        velocity_m_s=None if gnss.velocity_m_s is None else gnss.velocity_m_s[keep],
+        latency_sigma_s=gnss.latency_sigma_s,
     )
 
 

@@ -243,7 +243,7 @@ def name_unknown(reduced: Reduced, index: int) -> str:
     """Return the name of the unknown in a row of the reduced normal equations."""
     images, d, _ = reduced.border.shape
     if index >= d * images:
-        return f"border unknown {index - d * images} (free interior orientation, then GNSS shifts)"
+        return f"border unknown {index - d * images} (free interior orientation, then GNSS shifts, then latencies)"
     kind = ("projection centre", "rotation")[index % d // 3] if index % d < 6 else "interior orientation"
     return f"image {index // d} ({kind})"
 

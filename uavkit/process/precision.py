@@ -16,7 +16,7 @@ def total_redundancy(system: BundleSystem, weights: Weights, determined: Flags) 
     """Return the number of observations that take part (weights 0 or 1) less that of the unknowns."""
     used = 2.0 * float(np.sum(weights.rays * determined[system.point_of_ray]))
     direct = 3.0 * float(np.sum(weights.gnss) + np.sum(weights.control))
-    priors = np.concatenate([np.tile(system.prior_sigma, len(system.interior)), system.shift_sigma_m.ravel()])
+    priors = np.concatenate([np.tile(system.prior_sigma, len(system.interior)), system.gnss_prior_sigma])
     images = system.image_unknowns * len(system.given.projection_centres_m)
     unknowns = images + system.border + 3 * int(np.sum(determined))
     if system.datum is Datum.FREE_NETWORK:
@@ -47,8 +47,8 @@ def group_sigma0(system: BundleSystem, state: State, weights: Weights, precision
     if given.gnss is not None and system.uses_gnss:
         square, number = _group(found.gnss_m / given.gnss.sigma_m, weights.gnss, precision.gnss_leverage)
         variance = np.diag(precision.inverse.corner)[q:]
-        sigma = system.shift_sigma_m.ravel()
-        square += float(np.sum((state.shifts.ravel() / sigma) ** 2))
+        sigma = system.gnss_prior_sigma
+        square += float(np.sum((np.concatenate([state.shifts.ravel(), state.latencies]) / sigma) ** 2))
         number += float(np.sum(np.isfinite(sigma) - variance / sigma**2))
         sums["gnss"] = square, number
     if given.control is not None and system.uses_control:

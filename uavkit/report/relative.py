@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uavkit.core.adjustment import AdjustmentOptions, Datum
-from uavkit.core.arrays import Array
+from uavkit.core.arrays import Array, Indices
 from uavkit.core.observations import GnssObservations
 from uavkit.core.result import OrientedBlock
 from uavkit.report.measures import gnss_rows
@@ -65,8 +65,8 @@ def relative_precision(result: OrientedBlock) -> RelativePrecision | None:
 def _similarity_covariance(result: OrientedBlock, gnss: GnssObservations, middle_m: Array) -> Array | None:
     """Return the covariance (7, 7) of shift, rotation and scale about a place, as the GNSS positions fix them.
 
-    The common shift of each flight, of covariance S, is eliminated from its positions: with V = sum of J' P, the
-    normal matrix loses V (S^-1 + sum of P)^-1 V'.
+    What the positions of a flight have in common, shift and latency of covariance S, is eliminated: with B their
+    derivatives and V = sum of J' P B, the normal matrix loses V (S^-1 + sum of B' P B)^-1 V'.
     """
     adjusted = result.adjustment
     used = gnss_rows(result)[adjusted.gnss_used]
@@ -81,14 +81,26 @@ def _similarity_covariance(result: OrientedBlock, gnss: GnssObservations, middle
     normal = np.einsum("gai,ga,gaj->ij", derivative, weight, derivative)
     for number in np.unique(flight):
         mine = flight == number
-        common = np.einsum("gai,ga->ia", derivative[mine], weight[mine])
-        inner = np.linalg.inv(shifts[number]) + np.diag(weight[mine].sum(axis=0))
+        of_flight, information = _common_unknowns(gnss, used[mine], shifts[number])
+        common = np.einsum("gai,ga,gac->ic", derivative[mine], weight[mine], of_flight)
+        inner = information + np.einsum("gac,ga,gad->cd", of_flight, weight[mine], of_flight)
         normal -= common @ np.linalg.solve(inner, common.T)
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     scaled = normal / np.outer(scale, scale)
     if np.linalg.cond(scaled) > 1e10:  # the antennas lie on one line
         return None
     return np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale))
+
+
+def _common_unknowns(gnss: GnssObservations, rows: Indices, shift_covariance_m2: Array) -> tuple[Array, Array]:
+    """Return the derivatives (k, 3, c) of positions of one flight by shift and latency, and what is known (c, c)."""
+    by_shift = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
+    of_shift = np.asarray(np.linalg.inv(shift_covariance_m2), dtype=np.float64)
+    if gnss.latency_sigma_s is None or gnss.velocity_m_s is None:
+        return by_shift, of_shift
+    information = np.zeros((4, 4))
+    information[:3, :3], information[3, 3] = of_shift, gnss.latency_sigma_s**-2.0
+    return np.concatenate([by_shift, gnss.velocity_m_s[rows][:, :, None]], axis=2), information
 
 
 def _shift_covariances(result: OrientedBlock, gnss: GnssObservations) -> Array | None:

@@ -299,7 +299,7 @@ def _parameter_label(name: str) -> str:
 
 
 def gnss_shift_table(result: OrientedBlock) -> Table:
-    """Return shift and residuals of the GNSS positions of each flight."""
+    """Return shift and residuals of the GNSS positions of each flight, and the latency where it was estimated."""
     adjusted, unit, gnss = result.adjustment, length_unit(result).whole, result.block.gnss
     names, used = gnss_stations(result), adjusted.gnss_used
     flights = _flight_of_fix(result)
@@ -316,7 +316,12 @@ def gnss_shift_table(result: OrientedBlock) -> Table:
     header = ("Flight", "Fixes used", *(f"Shift {a} [{unit}]" for a in ("E", "N", "U")))
     header += tuple(f"RMS residual {a} [{unit}]" for a in ("E", "N", "U"))
     note = "" if gnss is None or len(names) else "No position takes part in the adjustment."
-    return Table(title="GNSS positions by flight", header=header, rows=tuple(rows), note=note)
+    if len(adjusted.gnss_latency_s):
+        header += ("Latency [ms]",)
+        latencies = zip(1e3 * adjusted.gnss_latency_s, 1e3 * adjusted.gnss_latency_sigma_s, strict=True)
+        rows = [(*row, f"{_signed(a, 1)} ± {number(b, 1)}") for row, (a, b) in zip(rows, latencies, strict=True)]
+        note += " Latency: by how much the positions are those of a later moment than the exposures."
+    return Table(title="GNSS positions by flight", header=header, rows=tuple(rows), note=note.strip())
 
 
 def _flight_of_fix(result: OrientedBlock) -> Array:
