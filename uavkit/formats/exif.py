@@ -1,4 +1,4 @@
-"""What a still's file says of itself: EXIF, and the XMP attributes that DJI's drones write.
+"""What a still's file says of itself: EXIF, and the XMP attributes that DJI's drones and Pix4D's cameras write.
 
 Heights in EXIF are by common practice of unknown datum (barometric, geoid or ellipsoid, whatever the maker thought of),
 although the standard's first editions say "sea level": they stay ``HeightDatum.UNKNOWN`` unless the file states more.
@@ -26,13 +26,17 @@ _GPS_TIME, _GPS_DATE, _GPS_ERROR_M = 7, 29, 31
 
 _XMP_ATTRIBUTE = re.compile(r'drone-dji:(\w+)\s*=\s*(?:"([^"]*)"|\'([^\']*)\')')
 _XMP_ELEMENT = re.compile(r"<drone-dji:(\w+)[^>/]*>([^<]*)</drone-dji:")
+_CAMERA_ATTRIBUTE = re.compile(r'\bCamera:(\w+)\s*=\s*(?:"([^"]*)"|\'([^\']*)\')')
+_CAMERA_ELEMENT = re.compile(r"<Camera:(\w+)[^<>/]*>([^<]*)</Camera:")
+_VERTICAL_CRS = {"EPSG:5773": HeightDatum.GEOID, "ellipsoidal": HeightDatum.ELLIPSOID}
+"""What Pix4D's Camera:VertCS says of EXIF's height; 5773 is EGM96, which ``geotag`` writes."""
 _RTK_WITH_SIGMA = {"34", "50"}
 """DJI's RtkFlag: 50 is fixed, 34 is float; 16 is a single-point position, whose stated sigmas mean nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DroneTags:
-    """What a DJI drone writes beside EXIF; None where it does not."""
+    """What a drone (DJI's mostly) writes beside EXIF; None where it does not."""
 
     absolute_altitude_m: float | None = None
     """Of the datum that ``altitude_type`` names; mostly barometric."""
@@ -46,6 +50,10 @@ class DroneTags:
     rtk_flag: str = ""
     rtk_sigma_horizontal_m: float | None = None
     rtk_sigma_vertical_m: float | None = None
+    camera_vertical_crs: str = ""
+    """Pix4D's Camera:VertCS, of EXIF's height; cameras and geotagging programs write it, and the accuracies below."""
+    camera_sigma_horizontal_m: float | None = None
+    camera_sigma_vertical_m: float | None = None
 
 
 def parse_drone_tags(xmp: bytes | str) -> DroneTags:
@@ -53,6 +61,8 @@ def parse_drone_tags(xmp: bytes | str) -> DroneTags:
     text = xmp.decode("utf-8", errors="replace") if isinstance(xmp, bytes) else xmp
     found = {key: one or two for key, one, two in _XMP_ATTRIBUTE.findall(text)}
     found |= {key: value for key, value in _XMP_ELEMENT.findall(text) if key not in found}
+    camera = {key: one or two for key, one, two in _CAMERA_ATTRIBUTE.findall(text)}
+    camera |= {key: value for key, value in _CAMERA_ELEMENT.findall(text) if key not in camera}
     horizontal = [_number(found.get("RtkStdLon")), _number(found.get("RtkStdLat"))]
     told = [value for value in horizontal if value is not None]
     return DroneTags(
@@ -65,6 +75,9 @@ def parse_drone_tags(xmp: bytes | str) -> DroneTags:
         rtk_flag=found.get("RtkFlag", "").strip(),
         rtk_sigma_horizontal_m=max(told) if told else None,
         rtk_sigma_vertical_m=_number(found.get("RtkStdHgt")),
+        camera_vertical_crs=camera.get("VertCS", "").strip(),
+        camera_sigma_horizontal_m=_number(camera.get("GPSXYAccuracy")),
+        camera_sigma_vertical_m=_number(camera.get("GPSZAccuracy")),
     )
 
 
@@ -133,8 +146,9 @@ def gps_position(gps: Mapping[int, Any], tags: DroneTags, name: str) -> GnssFix 
     if abs(latitude) > 90.0 or abs(longitude) > 180.0:
         return None
     height_m, datum = _height(gps, tags)
-    horizontal, vertical = _positive(gps.get(_GPS_ERROR_M)), None
-    if tags.rtk_flag in _RTK_WITH_SIGMA:
+    horizontal = _positive(tags.camera_sigma_horizontal_m) or _positive(gps.get(_GPS_ERROR_M))
+    vertical = _positive(tags.camera_sigma_vertical_m)
+    if tags.rtk_flag in _RTK_WITH_SIGMA and tags.camera_vertical_crs not in _VERTICAL_CRS:
         horizontal = _positive(tags.rtk_sigma_horizontal_m) or horizontal
         vertical = _positive(tags.rtk_sigma_vertical_m)
     return GnssFix(
@@ -163,7 +177,12 @@ def _height(gps: Mapping[int, Any], tags: DroneTags) -> tuple[float, HeightDatum
 
 
 def _datum(code: int, tags: DroneTags) -> HeightDatum:
-    """Only EXIF 3's codes 2 and 3 (sea level) and DJI's RtkAlt say what they mean; 0 and 1 were both before."""
+    """Camera:VertCS, EXIF 3's codes 2 and 3 (sea level) and DJI's RtkAlt say what they mean; 0 and 1 were both before.
+
+    Camera:VertCS comes first: in a copy that was given another position DJI's words of the first one still stand.
+    """
+    if tags.camera_vertical_crs in _VERTICAL_CRS:
+        return _VERTICAL_CRS[tags.camera_vertical_crs]
     if tags.altitude_type == "RtkAlt":
         return HeightDatum.ELLIPSOID
     return HeightDatum.GEOID if code in (2, 3) else HeightDatum.UNKNOWN
