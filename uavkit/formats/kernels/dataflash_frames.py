@@ -111,7 +111,7 @@ def holds_chain(data: Bytes, p: int, end: int, tables: Table, last_us: int) -> b
 @kernel
 def holds_message(data: Bytes, p: int, end: int, tables: Table, last_us: int) -> bool:
     """Tell whether a sure message begins inside the one from ``p`` to ``end``."""
-    for q in range(p + 3, end - 2):
+    for q in range(p + 3, min(end, len(data) - 1)):
         if data[q] == 0xA3 and data[q + 1] == 0x95 and is_sure(data, q, tables, last_us):
             return True
     return False
