@@ -40,9 +40,8 @@ def merged(
         scan = _Scan(body, {_key(*each) for each in properties})
     except expat.ExpatError as error:
         return _set_blindly(packet, values, prefixes, f"{name}: its XMP packet is damaged ({error})")
-    if scan.forbidden or scan.rdf_end is None:
-        why = "declares entities" if scan.forbidden else "holds no rdf:RDF"
-        raise InputError(f"{name}: its XMP packet {why}: it is no XMP; remove it from the still first")
+    except _NoPacketError as why:
+        raise InputError(f"{name}: its XMP packet {why}: it is no XMP; remove it from the still first") from why
     edits = [*((start, end, b"") for start, end in scan.cuts)]
     if values:
         edits.append(scan.insertion(description(values, prefixes, scan.rdf_prefix, scan.about)))
@@ -59,7 +58,7 @@ def description(values: Mapping[Property, str], prefixes: Mapping[str, str], rdf
     lines = [f"<{rdf}:Description{declared} {rdf}:about={quoteattr(about)}"]
     lines += [f"    xmlns:{prefixes[space]}={quoteattr(space)}" for space in used]
     lines += [f"   {prefixes[space]}:{name}={quoteattr(value)}" for (space, name), value in values.items()]
-    return (" " + "\n".join(lines) + "/>\n ").encode()
+    return ("\n  " + "\n".join(lines) + "/>").encode()
 
 
 def _set_blindly(packet: bytes, values: Mapping[Property, str], prefixes: Mapping[str, str], what: str) -> bytes:
@@ -95,16 +94,22 @@ def _key(namespace: str, name: str) -> Property:
     return namespace.rstrip("/"), name
 
 
+class _NoPacketError(Exception):
+    """Well-formed XML that is no XMP; the text says why."""
+
+
 class _Scan:
     """Where a packet's Descriptions hold certain properties, and where its RDF ends, in bytes."""
 
     def __init__(self, body: bytes, wanted: set[Property]) -> None:
-        self.rdf_end: int | None = None
-        """Of the end tag, or of the whole element where it is empty and has none."""
-        self.rdf_prefix, self.about, self.forbidden = "rdf", "", False
+        self.rdf_end = -1
+        """Where its end tag stands, or the whole element where it is empty and has none."""
+        self.rdf_prefix, self.about = "rdf", ""
         self.cuts: list[tuple[int, int]] = []
         self._body, self._wanted = body, wanted
         self._path: list[Property] = []
+        self._starts: list[tuple[int, int]] = []
+        """Of each element of the path: where its start tag begins and ends."""
         self._element_from: int | None = None
         self._description_from: int | None = None
         self._described = False
@@ -114,12 +119,15 @@ class _Scan:
         parser.StartDoctypeDeclHandler = self._doctype
         self._parser = parser
         parser.Parse(body, True)
+        if self.rdf_end < 0:
+            raise _NoPacketError("holds no rdf:RDF")
 
     def insertion(self, text: bytes) -> tuple[int, int, bytes]:
         """Return the edit that sets a Description at the end of the RDF element."""
-        at = self.rdf_end or 0
+        at = self.rdf_end
         if self._body.startswith(b"</", at):
-            return at, at, text
+            before = len(self._body[:at].rstrip(b" \t\r\n"))
+            return before, before, text
         end = self._tag_end(at)
         close = f"</{self.rdf_prefix}:RDF>" if self.rdf_prefix else "</RDF>"
         return end - 2, end, b">" + text + close.encode()
@@ -129,7 +137,7 @@ class _Scan:
         return tag.end() if tag is not None else start
 
     def _doctype(self, *_: object) -> None:
-        self.forbidden = True
+        raise _NoPacketError("declares entities")  # of which a few lines can fill the memory
 
     def _depth(self) -> int:
         """Return the element's depth below rdf:RDF, or -1 outside it."""
@@ -137,8 +145,10 @@ class _Scan:
         return len(self._path) - 1 - self._path.index(rdf) if rdf in self._path else -1
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
+        at = self._parser.CurrentByteIndex
         self._path.append(_split(name)[0])
-        depth, at = self._depth(), self._parser.CurrentByteIndex
+        self._starts.append((at, self._tag_end(at)))
+        depth = self._depth()
         if depth == 1 and self._path[-1] == _key(RDF, "Description"):
             self._look_at(attributes, at)
         elif depth == 2:
@@ -167,14 +177,17 @@ class _Scan:
             self.cuts.append(found.span())
 
     def _end(self, name: str) -> None:
-        at, depth = self._parser.CurrentByteIndex, self._depth()
+        (start, start_end), depth = self._starts.pop(), self._depth()
+        empty = self._body.endswith(b"/>", start, start_end)
+        # where an element without end tag ends expat does not tell the same in all versions
+        at = start if empty else self._parser.CurrentByteIndex
         if depth == 2 and self._element_from is not None:
             self._cut(self._element_from, self._tag_end(at))
             self._element_from = None
         if depth == 1 and self._description_from is not None:
             self._cut(self._description_from, self._tag_end(at))
             self._description_from = None
-        if depth == 0 and self.rdf_end is None:
+        if depth == 0 and self.rdf_end < 0:
             self.rdf_prefix, self.rdf_end = _split(name)[1], at
         self._path.pop()
 
