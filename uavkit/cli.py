@@ -304,6 +304,26 @@ def export(
         typer.echo(str(path))
 
 
+@app.command()
+def geotag(
+    survey: Survey,
+    out: Annotated[Path, typer.Option(help="Folder for the copies.", show_default=False)],
+    positions: Annotated[
+        Literal["adjusted", "measured"] | None,
+        typer.Option(help="Of the adjusted block, or as measured; else the adjusted ones where they are there."),
+    ] = None,
+) -> None:
+    """Write copies of the stills that carry their positions; pixels and all other data stay as they are."""
+    from uavkit import workflow
+    from uavkit.project import Project
+
+    project = Project(survey)
+    with progress_shown() as progress:
+        found = workflow.geotag(project, out, None if positions is None else positions == "measured", progress)
+    _say([f"no position, no copy: {name}: {reason}" for name, reason in found.without.items()])
+    typer.echo(f"{len(found.tags)} stills with their positions: {out}")
+
+
 log = typer.Typer(no_args_is_help=True, help="Flight logs: what is in one, and its contents for other programs.")
 app.add_typer(log, name="log")
 

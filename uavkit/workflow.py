@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from uavkit.core.flight_log import FlightLog
     from uavkit.core.vehicle import VehicleProfile
     from uavkit.formats.plan_request import PlanRequest, TerrainRequest
+    from uavkit.products.geotags import StillTags
 
 SIMULATION_LABEL = "simulation.json"
 """Beside simulated stills: which flight they repeat. It holds no truth."""
@@ -139,7 +140,7 @@ def begin_survey(project: Project, originals: Mapping[str, Path | Sequence[Path]
     }
     known = project.manifest.process if (project.folder / "manifest.json").is_file() else ()
     images = originals["images"]
-    label = _simulation_label(images) if isinstance(images, Path) else {}
+    label = _simulation_label(images if isinstance(images, Path) else images[0])
     project.save_manifest(Manifest(originals=found, ingest=options, process=known, **label))
 
 
@@ -283,6 +284,30 @@ def export(project: Project, target: str, folder: Path) -> list[Path]:
     return [path]
 
 
+def geotag(project: Project, out: Path, measured: bool | None, progress: Progress = silent) -> "StillTags":
+    """Write copies of the stills with their positions, and return what was written and what not.
+
+    ``measured`` chooses the positions as ingest has them, False the adjusted ones, None these where they are there.
+    """
+    from uavkit.formats.geotag import write_geotagged
+    from uavkit.products.geotags import adjusted_tags, measured_tags
+
+    _require(project, Stage.INGEST)
+    stills = _stills(project)
+    if out.resolve() in {folder.resolve() for folder in project.original_paths("images")}:
+        raise InputError(f"{out}: the originals lie there, which are never changed: name another folder")
+    adjusted = next(entry for entry in project.status() if entry.stage is Stage.PROCESS).standing is Standing.DONE
+    if measured is False:
+        _require(project, Stage.PROCESS)
+    use_adjusted = adjusted if measured is None else not measured
+    found = adjusted_tags(oriented_block(project)) if use_adjusted else measured_tags(read_block(project.block_file))
+    for done, (name, tag) in enumerate(sorted(found.tags.items())):
+        progress("geotag", done, len(found.tags))
+        write_geotagged(stills.path(name), out / name, tag)
+    progress("geotag", len(found.tags), len(found.tags))
+    return found
+
+
 def oriented_block(project: Project) -> OrientedBlock:
     """Return the result of process."""
     return read_oriented_block(project.result_file)
@@ -310,10 +335,10 @@ def _require(project: Project, stage: Stage) -> None:
 
 
 def _stills(project: Project) -> FileStillSource:
-    folder = project.original_path("images")
-    if folder is None:
+    folders = project.original_paths("images")
+    if not folders:
         raise InputError(f"{project.folder}: the manifest names no images: run 'uavkit ingest' again")
-    return FileStillSource(folder)
+    return FileStillSource(folders[0] if len(folders) == 1 else folders)
 
 
 def _video(project: Project) -> FileVideoSource | None:

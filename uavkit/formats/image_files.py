@@ -23,11 +23,20 @@ _JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 
 
 class FileStillSource:
-    """The stills of a folder, or of a list of files, in the order in which they were taken."""
+    """The stills of folders, or of a list of files, in the order in which they were taken."""
 
     def __init__(self, files: Path | Iterable[Path]) -> None:
-        """Take a folder's stills or the given files; raises InputError where there are none or names are doubled."""
-        paths = _stills_of_folder(files) if isinstance(files, Path) else [Path(path) for path in files]
+        """Take the stills of a folder, or the given files and the stills of the given folders.
+
+        Raises InputError where there are none or names are doubled.
+        """
+        given = [files] if isinstance(files, Path) else [Path(path) for path in files]
+        whole_folder = isinstance(files, Path)
+        paths = [
+            path
+            for place in given
+            for path in (_stills_of_folder(place) if whole_folder or place.is_dir() else [place])
+        ]
         if not paths:
             raise InputError("no stills were given: name at least one JPEG, TIFF or PNG file")
         self._paths: dict[str, Path] = {}
@@ -70,7 +79,7 @@ class FileStillSource:
     def drone_tags(self, name: str) -> DroneTags:
         """Return what a DJI drone wrote beside EXIF; all None for other cameras."""
         self.stills()
-        return self._tags.get(self._path(name).name, DroneTags())
+        return self._tags.get(self.path(name).name, DroneTags())
 
     def grey(self, name: str) -> Image:
         """Return grey values (height, width); of JPEG the luminance as coded. Raises InputError if unreadable."""
@@ -86,7 +95,7 @@ class FileStillSource:
 
     def fingerprint(self, name: str) -> str:
         """Return the SHA-256 of the file, computed again only where size or time of change differ."""
-        path = self._path(name)
+        path = self.path(name)
         try:
             status = path.stat()
             size, changed, known = self._hashes.get(name, (-1, -1, ""))
@@ -98,7 +107,8 @@ class FileStillSource:
             raise InputError(f"{path}: {_cause(path, error)}") from error
         return known
 
-    def _path(self, name: str) -> Path:
+    def path(self, name: str) -> Path:
+        """Return the file of a still; raises InputError for an unknown name."""
         if name not in self._paths:
             raise InputError(f"there is no still {name!r}{did_you_mean(name, self._paths)}")
         return self._paths[name]
@@ -106,7 +116,7 @@ class FileStillSource:
     def _decode(self, name: str, mode: int) -> Image:
         import cv2
 
-        path = self._path(name)
+        path = self.path(name)
         _refuse_truncated(path)
         content = np.fromfile(path, dtype=np.uint8)
         try:

@@ -1,0 +1,1 @@
+"""Products of a survey: what is made of its results for other programs and people."""
