@@ -89,8 +89,9 @@ class Sentences:
                 self._parts[kind].append(_decoded(kind, offsets, numbers[rows], texts[rows]))
 
     def fixes(self) -> tuple[FixTable, tuple[str, ...]]:
-        """Return a row for each epoch that has a sentence of position, and what is to be said of them."""
-        rows = {kind: _joined(kind, parts) for kind, parts in self._parts.items() if parts}
+        """Return a row for each epoch that has a sentence of position, and what is to be said of them; only once."""
+        parts, self._parts = self._parts, {}
+        rows = {kind: _joined(kind, parts.pop(kind)) for kind in _KINDS if parts[kind]}
         return _fixes(rows) if any(kind in rows for kind in _LATITUDE_FIELD) else (no_fixes(), ())
 
 

@@ -68,16 +68,18 @@ class _Collector:
                 self.texts.append(_text(payload))
 
     def messages(self) -> dict[str, Messages]:
-        """Return the decoded messages by name, kinds without a row left out."""
-        joined = {
-            name: Messages(
+        """Return the decoded messages by name, kinds without a row left out; they are no longer kept here."""
+        result = {}
+        while self._parts:
+            name, parts = self._parts.popitem()
+            joined = Messages(
                 rows=np.concatenate([part.rows for part in parts]),
                 lengths=np.concatenate([part.lengths for part in parts]),
                 offsets=np.concatenate([part.offsets for part in parts]),
             )
-            for name, parts in self._parts.items()
-        }
-        return {name: messages for name, messages in joined.items() if len(messages.rows)}
+            if len(joined.rows):
+                result[name] = joined
+        return result
 
 
 def _text(payload: bytes) -> str:
@@ -138,9 +140,13 @@ def _notes(table: FixTable, counts: Counter[str]) -> Iterator[str]:
     """Yield what is to be said of the positions and the raw measurements."""
     if len(table) == 0:
         yield "there are no positions in it"
-    fixed = (table.fix_type >= FixType.TWO_DIMENSIONAL) & (table.when.gps_ns == NO_TIME)
-    if fixed.any():
-        yield f"{int(fixed.sum())} positions have no GPS time"
+    fixed = table.fix_type >= FixType.TWO_DIMENSIONAL
+    placeless = int(np.sum(fixed & np.isnan(table.latitude_deg + table.longitude_deg)))
+    if placeless:
+        yield f"{placeless} rows with a fix have no valid position"
+    timeless = int(np.sum(fixed & (table.when.gps_ns == NO_TIME)))
+    if timeless:
+        yield f"{timeless} positions have no GPS time"
     raw = sum(counts[name] for name in _RAW)
     if raw:
         yield f"{raw} epochs of raw measurements are kept for RINEX converters (uavkit.formats.ubx.raw_measurements)"

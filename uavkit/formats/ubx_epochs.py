@@ -28,10 +28,13 @@ from uavkit.formats.receiver_times import (
 )
 
 JOINED = ("NAV-POSLLH", "NAV-STATUS", "NAV-SOL", "NAV-PVT", "NAV-VELNED", "NAV-HPPOSLLH", "NAV-TIMEGPS", "NAV-TIMEUTC")
-POSITIONED = ("NAV-PVT", "NAV-HPPOSLLH", "NAV-POSLLH")
+POSITIONED = ("NAV-HPPOSLLH", "NAV-PVT", "NAV-POSLLH")
+"""The best first."""
 NO_COUNT = -1
 """Marks an unknown count of leap seconds."""
 _MS_NS = 1_000_000
+_ROUNDED_NS = 10 * _MS_NS
+"""UTC's fields are rounded, to 1/100 s at most, and ``nano`` corrects them: its sign does not change the second."""
 _FARTHEST_LEAP_S = 30
 """UTC that is farther than this from the time of week is not of a wrong count of leap seconds."""
 _LEAST_UNKNOWN_MM = 4_000_000_000
@@ -218,7 +221,8 @@ def _with_week_of(utc_gps_ns: Indices, tow_ns: Indices) -> tuple[Indices, Indice
     rest = utc - base - seconds * SECOND_NS
     near = known & (np.abs(seconds) <= _FARTHEST_LEAP_S)
     gps_ns = np.where(near, base + np.where(np.abs(rest) <= _MS_NS, rest, 0), np.where(known, utc, NO_TIME))
-    return gps_ns, np.where(near, dated_leap_seconds(base) - seconds, NO_COUNT)
+    used = dated_leap_seconds(utc + _ROUNDED_NS)
+    return gps_ns, np.where(near, used - seconds, NO_COUNT)
 
 
 def _with_nearest_week(gps_ns: Indices, tow_ns: Indices, denied: NDArray[np.bool_]) -> Indices:
@@ -260,7 +264,7 @@ def _leap_notes(gps_ns: Indices, counts: Indices, told: Indices) -> tuple[str, .
     for count in np.unique(counts[wrong]).tolist():
         rows = int(np.sum(wrong & (counts == count)))
         notes.append(
-            f"the receiver's UTC is of {count} leap seconds in {rows} epochs, the dated table has "
+            f"the receiver's UTC is of {count} leap seconds in {rows} of {len(counts)} epochs, the dated table has "
             f"{_range(dated[wrong & (counts == count)])}: times are from the time of week"
         )
     usual = set(np.unique(dated[known]).tolist())
@@ -318,7 +322,7 @@ def _positions(messages: Mapping[str, Messages], epochs: Epochs, fixes: NDArray[
 def _positions_of(
     messages: Mapping[str, Messages], epochs: Epochs, kind: str
 ) -> tuple[NDArray[np.bool_], dict[str, Array]]:
-    """Return where epochs have a message of a kind, and its columns, (m,) each."""
+    """Return where epochs have a message of a kind, and its columns, (m,) each; a place off the earth is unknown."""
 
     def value(name: str) -> Array:
         return np.asarray(_column(messages, epochs, kind, name)[0], dtype=np.float64)
@@ -331,7 +335,7 @@ def _positions_of(
         place["lon"] += value("lonHp") * 0.01
         place["height"] += value("heightHp") * 0.1
         place["hMSL"] += value("hMSLHp") * 0.1
-    bad = _invalid(messages, epochs, kind)
+    bad = _invalid(messages, epochs, kind) | (np.abs(place["lat"]) > 90e7) | (np.abs(place["lon"]) > 180e7)
     lat, lon, height, above_sea = (np.where(bad, np.nan, place[name]) for name in ("lat", "lon", "height", "hMSL"))
     unit_m = 1e-4 if fine else 1e-3
     horizontal, vertical = (_sigma(value(name), unit_m) for name in ("hAcc", "vAcc"))
