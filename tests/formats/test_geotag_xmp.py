@@ -43,6 +43,7 @@ def properties(text: bytes) -> dict[str, list[str]]:
         "</rdf:Description>",
         '<rdf:Description xmlns:o="urn:own/" o:Height="7"/>'
         '<rdf:Description xmlns:o="urn:own/" o:Height="8" o:Other="9"/>',
+        '<rdf:Description xmlns:o="urn:own/" o:Height="7"><q:x xmlns:q="urn:q">1</q:x></rdf:Description>',
         '<rdf:Description xmlns:q="urn:q" q:text="o:Height=&quot;7&quot; > &lt;">'
         "<q:l><rdf:Seq><rdf:li>1</rdf:li></rdf:Seq></q:l>"
         "</rdf:Description>",

@@ -131,6 +131,12 @@ def test_nothing_of_picture_index_changes_where_the_size_stays() -> None:
     assert made_anew(b"\xff\xd8" + old + index + SCAN, {0: new}, []) == b"\xff\xd8" + new + index + SCAN
 
 
+def test_a_mended_picture_index_keeps_its_length() -> None:
+    index = segment(APP2, picture_index(">", [(999, 0), (5, 1000)]), fill=2)
+    grown, mended = segment(APP2, picture_index(">", [(1004, 0), (5, 1000)]), fill=2), b"\xff\xd8added"
+    assert made_anew(b"\xff\xd8" + index + SCAN, {}, [(0, b"added")]) == mended + grown + SCAN
+
+
 @settings(derandomize=True, max_examples=200, deadline=None)
 @given(st.binary(max_size=80))
 def test_no_picture_index_breaks_the_writer(block: bytes) -> None:

@@ -183,7 +183,7 @@ def _fitted(packet: bytes, grown: int) -> bytes:
     """Return the packet with less padding: so that the file does not grow, or else so that a segment holds it."""
     too_long = len(jpeg.XMP_HEADER) + len(packet) - jpeg.LARGEST_PAYLOAD
     for by in (grown, too_long):
-        if 0 < by <= xmp_packet.padding(packet) and too_long <= by:
+        if 0 < by <= xmp_packet.padding(packet):
             return xmp_packet.shortened(packet, by)
     return packet
 
