@@ -10,7 +10,6 @@ https://www.topografix.com/GPX/1/1/
 
 import math
 import re
-from datetime import UTC, datetime
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -32,10 +31,9 @@ from uavkit.core.flight_log import (
     no_exposures,
     no_fixes,
 )
-from uavkit.core.gpstime import gps_time_ns_from_utc
 from uavkit.core.progress import Progress
 from uavkit.formats.log_bytes import DamageTally, opened
-from uavkit.formats.log_lines import Columns, head_text, is_place, number
+from uavkit.formats.log_lines import Columns, gps_time_of, head_text, is_place, number
 from uavkit.formats.xml_records import XmlKind, XmlReader, local
 
 KIND = XmlKind(name="GPX", records=frozenset({"trkpt", "wpt", "rtept"}), resume=b"<gpx><trk><trkseg>")
@@ -104,18 +102,6 @@ def _take(point: ElementTree.Element, points: _Points) -> str | None:
     )
     points.names.append(texts.get("name", "")[:200])
     return None
-
-
-def gps_time_of(text: str) -> int | None:
-    """Return the GPS time of an ISO 8601 instant, UTC where it names no zone; None for a date alone."""
-    text = text.strip()
-    if len(text) < 16:
-        return None
-    try:
-        moment = datetime.fromisoformat(text)
-        return gps_time_ns_from_utc((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).astimezone(UTC))
-    except (ValueError, OverflowError):
-        return None
 
 
 def _log(path: Path, points: dict[str, _Points], reader: XmlReader, tally: DamageTally) -> FlightLog:

@@ -5,12 +5,13 @@ import re
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import BinaryIO
 
 import numpy as np
 
 from uavkit.core.arrays import Array, Indices
-from uavkit.core.gpstime import NO_TIME
+from uavkit.core.gpstime import NO_TIME, gps_time_ns_from_utc
 
 LONGEST_LINE = 64 * 1024
 """Bytes; what is longer is no line of a log and comes in pieces."""
@@ -66,6 +67,18 @@ def nanoseconds(text: str) -> int | None:
     if value > 2**62:
         return None
     return -value if found[1] == "-" else value
+
+
+def gps_time_of(text: str) -> int | None:
+    """Return the GPS time of an ISO 8601 instant, UTC where it names no zone; None for a date alone."""
+    text = text.strip()
+    if len(text) < 16:
+        return None
+    try:
+        moment = datetime.fromisoformat(text)
+        return gps_time_ns_from_utc((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).astimezone(UTC))
+    except (ValueError, OverflowError):
+        return None
 
 
 def is_place(latitude_deg: float, longitude_deg: float) -> bool:
