@@ -165,6 +165,8 @@ def test_exiftool_reads_every_tag(tmp_path: Path) -> None:
     sources.append(write_still(tmp_path / "bare.jpg"))
     Image.fromarray(picture()).save(tmp_path / "a.tif")
     sources.append(tmp_path / "a.tif")
+    Image.fromarray(picture()).save(tmp_path / "a.png")
+    sources.append(tmp_path / "a.png")
     for found in tags_of(*(geotagged(source, full_tag()) for source in sources)):
         assert found["GPS:GPSVersionID"] == "2 3 0 0"
         assert (found["GPS:GPSLatitudeRef"], found["GPS:GPSLongitudeRef"]) == ("S", "E")
@@ -411,6 +413,49 @@ def test_a_motorola_tiff_with_a_packet_keeps_what_it_says(tmp_path: Path) -> Non
         assert b"Camera:Yaw" in image.tag_v2[700]  # type: ignore[attr-defined]
 
 
+@pytest.mark.parametrize("compressed", [True, False])
+def test_pngs_change_in_two_chunks(tmp_path: Path, compressed: bool) -> None:
+    from PIL import PngImagePlugin
+
+    source = tmp_path / "a.png"
+    info = PngImagePlugin.PngInfo()
+    info.add_itxt("XML:com.adobe.xmp", packet('<rdf:Description xmlns:q="q" q:w="kept"/>').decode(), zip=compressed)
+    info.add_text("Comment", "stays")
+    Image.fromarray(picture()).save(source, pnginfo=info, exif=b"Exif\0\0" + exif_block(">", gps=old_gps(">")))
+    copy = geotagged(source, full_tag())
+    assert position(copy) == pytest.approx((-35.800_000_123, 139.650_000_456, 55.432), abs=1e-9)
+    assert read_header(copy)[0].maker == "Maker"
+    with Image.open(source) as before, Image.open(copy) as after:
+        assert np.array_equal(np.asarray(before), np.asarray(after))
+        assert after.info["Comment"] == "stays"
+        assert b'q:w="kept"' in after.info["xmp"]
+        assert b"Camera:Yaw" in after.info["xmp"]
+    again = geotagged(copy, full_tag(latitude_deg=1.0), "again.png")
+    assert position(again)[0] == 1.0
+    first = copy.read_bytes()
+    assert [again.read_bytes().count(kind) for kind in (b"eXIf", b"iTXt")] == [1, 1]
+    pixels = first[first.index(b"IDAT") - 4 :]
+    assert source.read_bytes().endswith(pixels)
+    assert again.read_bytes().endswith(pixels)
+
+
+def test_mutated_pngs_give_an_input_error_or_a_copy(tmp_path: Path) -> None:
+    source = tmp_path / "a.png"
+    stills, rng, copied = [], random.Random(4), 0
+    for exif in ({}, {"exif": b"Exif\0\0" + exif_block("<", thumbnail=False)}):
+        Image.fromarray(picture(8, 6)).save(source, **exif)  # type: ignore[arg-type]
+        stills.append(source.read_bytes())
+    for index in range(200):
+        source.write_bytes(mutated(stills[index % 2], rng))
+        try:
+            copy = geotagged(source, full_tag())
+        except InputError:
+            continue
+        copied += 1
+        assert b"Camera:Yaw" in copy.read_bytes()
+    assert copied > 20
+
+
 def test_originals_are_neither_changed_nor_overwritten(tmp_path: Path) -> None:
     source = write_still(tmp_path / "a.jpg", exif=exif_block("<"))
     before = source.read_bytes()
@@ -433,8 +478,8 @@ def test_originals_are_neither_changed_nor_overwritten(tmp_path: Path) -> None:
     "content, what",
     [
         (b"", "is empty"),
-        (b"\x89PNG\r\n\x1a\n" + bytes(20), "is a PNG"),
-        (b"just some text", "neither JPEG nor TIFF"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(4), "cut short"),
+        (b"just some text", "neither JPEG, TIFF nor PNG"),
         (b"\xff\xd8\xff\xe1", "cut short"),
         (b"II+\0\x08\0\0\0" + bytes(20), "BigTIFF"),
         (b"II*\0\xff\xff\0\0", "damaged"),

@@ -16,13 +16,11 @@ from uavkit.formats.jpeg_segments import (
     LARGEST_PAYLOAD,
     MPF_HEADER,
     XMP_HEADER,
-    Copied,
     encode_segment,
-    joined,
     read_segments,
     rebuilt,
-    write_pieces,
 )
+from uavkit.formats.pieces import Copied, joined, write_pieces
 
 SCAN = b"\xff\xda\x00\x02" + bytes(range(256)) + b"\xff\xd9"
 """A start of scan, picture data of any kind, the end of image."""

@@ -22,8 +22,10 @@ from uavkit.core.frames import geoid_undulation_m
 from uavkit.core.gpstime import utc_from_gps_time_ns
 from uavkit.core.heights import HeightDatum
 from uavkit.formats import jpeg_segments as jpeg
+from uavkit.formats import png_chunks as png
 from uavkit.formats import xmp_packet
 from uavkit.formats.atomic import atomic_path
+from uavkit.formats.pieces import write_pieces
 from uavkit.formats.tiff_tags import EMPTY_BLOCK, Field, TagBlock, without
 
 PIX4D_CAMERA = "http://pix4d.com/camera/1.0/"
@@ -113,14 +115,15 @@ def _check_rotation(R: Array | None) -> None:
 
 
 def write_geotagged(source: Path, target: Path, tag: GeoTag) -> None:
-    """Write a copy of a JPEG or TIFF with the position; the source is only read, the copy gets its time of change.
+    """Write a copy of a JPEG, TIFF or PNG with the position; the source is only read, the copy gets its time of change.
 
     In a JPEG the EXIF and XMP segments change (and what MPF says of their size), all else is the same byte for byte. If
     the XMP packet has padding enough the file keeps its size, so that whatever points behind the picture still
-    fits. In a TIFF the new parts are appended. Other tags, maker notes and thumbnails stay where they are.
+    fits. In a TIFF the new parts are appended, in a PNG the two chunks change. Other tags, maker notes and thumbnails
+    stay where they are. XMP of others that repeats the old position (DJI's, Adobe's exif:) is left as it is.
 
-    Raises InputError where source and target are the same file, the source is neither JPEG nor TIFF or is damaged, the
-    position does not fit into a JPEG's segments, or the copy cannot be written.
+    Raises InputError where source and target are the same file, the source is of another kind or damaged, the position
+    does not fit into a JPEG's segments, or the copy cannot be written.
     """
     _refuse_same_file(source, target)
     try:
@@ -150,8 +153,10 @@ def _writer(head: bytes, source: Path) -> Callable[[BinaryIO, BinaryIO, GeoTag, 
         return _write_jpeg
     if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         return _write_tiff
-    kind = "a PNG" if head == b"\x89PNG\r\n\x1a\n" else "empty" if not head else "neither JPEG nor TIFF"
-    raise InputError(f"{source}: is {kind}: positions are written into JPEG and TIFF stills only")
+    if head == png.SIGNATURE:
+        return _write_png
+    kind = "neither JPEG, TIFF nor PNG" if head else "empty"
+    raise InputError(f"{source}: is {kind}: positions are written into such stills only")
 
 
 def _write_jpeg(source: BinaryIO, copy: BinaryIO, tag: GeoTag, name: str) -> None:
@@ -170,7 +175,7 @@ def _write_jpeg(source: BinaryIO, copy: BinaryIO, tag: GeoTag, name: str) -> Non
             first = max(first, place + 1) if header == jpeg.EXIF_HEADER else first
         elif payload:
             added.append((first, jpeg.encode_segment(jpeg.APP1, header + payload, name)))
-    jpeg.write_pieces(source, jpeg.rebuilt(segments, changed, added), copy)
+    write_pieces(source, jpeg.rebuilt(segments, changed, added), copy)
 
 
 def _growth(old: bytes | None, new: bytes, header: bytes) -> int:
@@ -210,6 +215,17 @@ def _write_tiff(source: BinaryIO, copy: BinaryIO, tag: GeoTag, name: str) -> Non
     for offset, data in edit.overwritten.items():
         copy.seek(offset)
         copy.write(data)
+
+
+def _write_png(source: BinaryIO, copy: BinaryIO, tag: GeoTag, name: str) -> None:
+    chunks = png.read_chunks(source, name)
+    old_exif, old_xmp = png.payload(chunks, png.EXIF, name), png.payload(chunks, png.XMP, name)
+    block = TagBlock.of_bytes(old_exif or EMPTY_BLOCK, name)
+    new = {png.EXIF: block.with_fields(gps_fields(tag, block), None).applied(old_exif or EMPTY_BLOCK)}
+    packet = xmp_packet.merged(old_xmp, xmp_properties(tag), _PREFIXES, name)
+    if packet != (old_xmp or b""):
+        new[png.XMP] = packet
+    write_pieces(source, png.rebuilt(chunks, new), copy)
 
 
 def gps_fields(tag: GeoTag, block: TagBlock) -> list[Field]:

@@ -1,4 +1,4 @@
-"""The segments before a JPEG's picture data, and files made anew of pieces of old ones.
+"""The segments before a JPEG's picture data, and the pieces of a file with some of them changed.
 
 ITU-T T.81, annex B: a segment is a marker (0xFF, any number of 0xFF before it, a code) and, but for a few codes, a
 length of two bytes that counts itself. Only what stands before the first scan is looked at; all else is a range of
@@ -7,10 +7,11 @@ bytes to copy.
 
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import BinaryIO
 
 from uavkit.core.errors import InputError
+from uavkit.formats.pieces import Copied, Piece
 
 APP0, APP1, APP2 = 0xE0, 0xE1, 0xE2
 EXIF_HEADER = b"Exif\0\0"
@@ -22,7 +23,6 @@ LARGEST_PAYLOAD = 0xFFFF - 2
 _SOI, _EOI, _SOS, _TEM = 0xD8, 0xD9, 0xDA, 0x01
 _MOST_SEGMENTS = 100_000
 """Thermal cameras keep megabytes in segments (some hundreds); beyond this the file is made to exhaust the reader."""
-_COPY_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,18 +39,6 @@ class Segment:
     def holds(self, header: bytes) -> bool:
         """Tell whether the payload is kept and begins so."""
         return self.payload is not None and self.payload.startswith(header)
-
-
-@dataclass(frozen=True, slots=True)
-class Copied:
-    """Bytes ``start`` to ``end`` of the source; ``end`` None is the end of the file."""
-
-    start: int
-    end: int | None
-
-
-Piece = Copied | bytes
-"""A file made anew is a sequence of these."""
 
 
 def read_segments(stream: BinaryIO, name: str) -> tuple[Segment, ...]:
@@ -178,28 +166,3 @@ def _image_entries(block: bytes, order: str) -> Iterator[int]:
                 yield from range(offset, min(offset + size, len(block)) - 15, 16)
     except struct.error:
         return
-
-
-def write_pieces(source: BinaryIO, pieces: Sequence[Piece], target: BinaryIO) -> None:
-    """Write the pieces one after the other; ranges of the source are copied in blocks."""
-    for piece in joined(pieces):
-        if isinstance(piece, bytes):
-            target.write(piece)
-            continue
-        source.seek(piece.start)
-        left = piece.end - piece.start if piece.end is not None else None
-        while block := source.read(_COPY_BYTES if left is None else min(left, _COPY_BYTES)):
-            target.write(block)
-            left = None if left is None else left - len(block)
-
-
-def joined(pieces: Sequence[Piece]) -> list[Piece]:
-    """Return the pieces with neighbouring ranges made one."""
-    result: list[Piece] = []
-    for piece in pieces:
-        last = result[-1] if result else b""
-        if isinstance(piece, Copied) and isinstance(last, Copied) and last.end == piece.start:
-            result[-1] = replace(last, end=piece.end)
-        else:
-            result.append(piece)
-    return result
