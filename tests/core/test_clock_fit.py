@@ -82,3 +82,11 @@ def test_unix_times_cross_the_leap_second_of_2017():
     assert gps_times_ns_from_unix_ns(unix).tolist() == expected
     assert [leap_seconds_at(time) for time in expected[:3]] == [17, 18, 18]
     assert gps_times_ns_from_unix_ns(np.array([315_964_800 * 10**9])).tolist() == [0]
+
+
+def test_two_pairs_that_contradict_each_other() -> None:
+    """The mean of both is near neither: one is kept."""
+    boot = np.array([10, 20], dtype=np.int64) * 10**9
+    clock = fit_clock(boot, boot + np.array([0, 500], dtype=np.int64) * 10**9)
+    assert clock is not None
+    assert clock.rejected == 1

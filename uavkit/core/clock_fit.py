@@ -83,7 +83,7 @@ def fit_clock(boot_ns: Indices, gps_ns: Indices) -> ClockFit | None:
     boot, gps = boot[known][order], gps[known][order]
     if len(boot) == 0:
         return None
-    zero = int(np.median(gps - boot))
+    zero = int(np.sort(gps - boot)[len(boot) // 2])  # one of them: the mean of two may be near none
     difference_s = (gps - boot - zero) * 1e-9
     since_s = (boot - boot[len(boot) // 2]) * 1e-9
     near = np.abs(difference_s) < FAR_S + GREATEST_DRIFT * float(since_s[-1] - since_s[0])
