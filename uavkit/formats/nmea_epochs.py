@@ -50,7 +50,7 @@ _OF_MODE = {
     "N": FixType.NO_FIX, "E": FixType.NO_FIX, "V": FixType.NO_FIX, "A": FixType.THREE_DIMENSIONAL,
     "P": FixType.THREE_DIMENSIONAL, "D": FixType.DIFFERENTIAL, "F": FixType.RTK_FLOAT, "R": FixType.RTK_FIXED,
 }  # fmt: skip
-"""Mode indicators, the worst first."""
+"""Mode indicators; M and S (manual, simulator) are unknown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,7 +108,7 @@ def _joined(kind: str, parts: list[_Rows]) -> _Rows:
 
 
 def _decoded(kind: str, offsets: Indices, numbers: Array, texts: Indices) -> _Rows:
-    """Return the sentences of a kind from their fields, (n, FIELDS)."""
+    """Return the sentences of a kind from their fields, (n, FIELDS); those that leave their time open are left out."""
     columns: dict[str, Array] = {}
     if kind in _LATITUDE_FIELD:
         at = _LATITUDE_FIELD[kind]
@@ -140,10 +140,13 @@ def _decoded(kind: str, offsets: Indices, numbers: Array, texts: Indices) -> _Ro
         columns = {"speed": _vtg_speed(numbers, texts), "course": numbers[:, 1]}
     elif kind == "GSA":
         columns = {"dimensions": numbers[:, 2]}
-    seconds = (
-        _second_of_day_ns(numbers[:, _TIME_FIELD[kind]]) if kind in _TIME_FIELD else np.full(len(numbers), NO_TIME)
-    )
-    return _Rows(offsets=offsets, second_ns=seconds, columns={name: columns[name] for name in _COLUMNS[kind]})
+    if kind not in _TIME_FIELD:
+        seconds = np.full(len(numbers), NO_TIME, dtype=np.int64)
+        return _Rows(offsets=offsets, second_ns=seconds, columns={name: columns[name] for name in _COLUMNS[kind]})
+    seconds = _second_of_day_ns(numbers[:, _TIME_FIELD[kind]])
+    timed = seconds != NO_TIME
+    kept = {name: columns[name][timed] for name in _COLUMNS[kind]}
+    return _Rows(offsets=offsets[timed], second_ns=seconds[timed], columns=kept)
 
 
 def _degrees(number: Array, letter: Indices, letters: str, most: float) -> Array:
@@ -200,14 +203,14 @@ def _mapped(number: Array, mapping: "dict[int, FixType]") -> Array:
 
 
 def _of_modes(text: Indices) -> Array:
-    """Return the best of the mode indicators of the satellite systems (GNS), (n,) FixType."""
+    """Return the best of the mode indicators of the satellite systems (GNS), (n,) FixType; M and S are unknown."""
+    letters = (text[:, None] >> np.arange(0, 56, 8)) & 255
     result = np.full(len(text), float(FixType.NO_FIX))
     for letter, fix in _OF_MODE.items():
-        there = np.zeros(len(text), dtype=np.bool_)
-        for place in range(7):
-            there |= (text >> (8 * place)) & 255 == ord(letter)
+        there = np.any(letters == ord(letter), axis=1)
         result[there] = np.maximum(result[there], fix)
-    return result
+    other = (text == 0) | np.any((letters == ord("M")) | (letters == ord("S")), axis=1)
+    return np.where(other & (result == FixType.NO_FIX), float(FixType.UNKNOWN), result)
 
 
 def _of_status(status: Indices, mode: Indices) -> Array:
@@ -291,7 +294,7 @@ def _table(values: dict[str, dict[str, Array]], epoch_ns: Indices) -> tuple[FixT
     if unknown:
         notes = (
             *notes,
-            f"{unknown} of {len(table)} positions have no date (RMC and ZDA tell it): their time is unknown",
+            f"{unknown} of {len(table)} rows have no time: RMC and ZDA tell the date, and only with a fix",
         )
     return table, notes
 

@@ -11,7 +11,14 @@ FIELDS = 20
 
 @kernel
 def _number(block: NDArray[np.uint8], begin: int, end: int) -> float:
-    """Return a decimal number, NaN where the field is empty, longer than 18 digits or anything else."""
+    """Return a decimal number, NaN where the field is empty, longer than 18 digits or anything else.
+
+    Blanks around it do not count.
+    """
+    while begin < end and block[begin] == 32:
+        begin += 1
+    while begin < end and block[end - 1] == 32:
+        end -= 1
     j, sign = begin, 1.0
     if j < end and (block[j] == 45 or block[j] == 43):
         sign = -1.0 if block[j] == 45 else 1.0
