@@ -9,6 +9,7 @@ import pytest
 from uavkit.core.errors import InputError
 from uavkit.core.flight_log import FlightLog, Stamps, fix_table
 from uavkit.core.frames import LocalFrame
+from uavkit.core.heights import HeightDatum
 from uavkit.ingest.gnss_delay import ESTIMATE_LAG_SIGMA_S, GnssDelay, estimate_gnss_delay
 from uavkit.ingest.trajectory import Trajectory, build_trajectory
 
@@ -68,7 +69,8 @@ def test_errors_of_the_delay_are_standard_normal(correlation: float) -> None:
 
 def test_wrong_fixes_hardly_count() -> None:
     clean, spoilt = (measured(np.random.default_rng(3), 0.12, wrong=wrong) for wrong in (0, 40))
-    assert abs(spoilt.delay_s - 0.12) < 3.0 * max(spoilt.scatter_s, clean.scatter_s)
+    # Least squares would move it by the errors of 3.6 m of a twentieth of the fixes: some 10 ms.
+    assert abs(spoilt.delay_s - 0.12) < 4.0 * clean.scatter_s < 0.003
 
 
 def test_a_hovering_vehicle_tells_nothing() -> None:
@@ -104,6 +106,7 @@ def test_recorded_flights(name: str) -> None:
     log = read_log(path, silent)
     fixes, estimates = build_trajectory(log.fix_table), build_trajectory(log.estimate_table)
     found = estimate_gnss_delay(estimates, fixes)
+    assert fixes.height_datum is estimates.height_datum is HeightDatum.GEOID  # the simulator has no undulation
     truth = _true_delay(path, log, fixes)
     assert truth.scatter_s < 1e-3
     assert abs(found.delay_s - truth.delay_s) < found.sigma_s

@@ -5,10 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bundle_blocks import Plan, SimulatedBlock, simulate
+from made_blocks import SMALL as SMALL_CAMERA
+from made_blocks import block_of
 
 from uavkit.core.adjustment import AdjustmentInput, AdjustmentOptions, AdjustmentResult, Datum
 from uavkit.core.observations import GnssObservations
 from uavkit.formats.record_codec import InlineArrays, decode, encode
+from uavkit.process import network
 from uavkit.process.bundle import adjust_block
 from uavkit.process.bundle_system import (
     BundleSystem,
@@ -17,6 +20,7 @@ from uavkit.process.bundle_system import (
     State,
     border_priors,
     build_system,
+    gauss_newton_step,
     misclosures,
     moved,
     precision_at,
@@ -24,6 +28,7 @@ from uavkit.process.bundle_system import (
 )
 from uavkit.process.elimination import dissect
 from uavkit.process.normal_equations import dense_matrix, factor_dense
+from uavkit.process.precision import group_sigma0
 from uavkit.process.sparse_factor import SparseFactoriser
 
 PLAIN = AdjustmentOptions(robust=False)
@@ -235,6 +240,41 @@ def test_sparse_and_dense_equations_agree(system: BundleSystem) -> None:
     corners = [result.inverse.corner / _sigmas(results[0]) / _sigmas(results[0])[:, None] for result in results]
     np.testing.assert_allclose(corners[0], corners[1], atol=1e-6)
     np.testing.assert_allclose(results[0].gnss_leverage, results[1].gnss_leverage, rtol=1e-6)
+
+
+def test_a_step_gains_what_it_promises(system: BundleSystem) -> None:
+    """The a priori observation of the latency, far from its value, is in the sum of squares and in the promise."""
+    gnss = replace(_gnss(system.given), latency_sigma_s=0.002)
+    block = simulate(np.random.default_rng(6), GNSS_ONLY, start_error=0.01)
+    held = build_system(replace(_flown(block, LATENCY_S), gnss=gnss), Datum.GNSS, (2.0, 2.0, 3.0))
+    start = replace(held.start(), latencies=np.array([0.1, -0.1]))
+    step = gauss_newton_step(held, start, held.full_weights(), 0.0)
+    assert step.gain == pytest.approx(1.0, abs=0.02)
+    assert step.size**2 > 2.0 * (0.09 / 0.002) ** 2  # most of the promise is made by the latencies
+
+
+def test_sigma0_of_the_positions_holds_shifts_and_latencies(system: BundleSystem) -> None:
+    state, weights = _off(system), system.full_weights()
+    precision = precision_at(system, state, weights)
+    priors = np.concatenate([np.tile([2.0, 2.0, 3.0], 2), [0.3, 0.3]])
+    values = np.concatenate([state.shifts.ravel(), state.latencies])
+    z = misclosures(system, state).gnss_m / _gnss_sigma(system)
+    square = np.sum(z**2) + np.sum((values / priors) ** 2)
+    variance = np.diag(precision.inverse.corner)[-8:]
+    number = np.sum(1.0 - precision.gnss_leverage) + np.sum(1.0 - variance / priors**2)
+    found = group_sigma0(system, state, weights, precision)["gnss"]
+    assert found == pytest.approx(np.sqrt(square / number), rel=1e-9)
+
+
+def test_velocities_of_stills_that_are_not_oriented_are_left_out() -> None:
+    gnss = _gnss(_flown(simulate(np.random.default_rng(3), WITH_CONTROL), 0.0))
+    assert gnss.velocity_m_s is not None
+    block = block_of(len(gnss), SMALL_CAMERA, gnss=gnss)
+    chosen = np.array([0, 1, 3, 4, 5, 8])
+    kept = network._gnss(block, chosen)
+    assert kept is not None
+    np.testing.assert_array_equal(kept.velocity_m_s, gnss.velocity_m_s[chosen])
+    assert kept.latency_sigma_s == gnss.latency_sigma_s
 
 
 def test_redundancy_counts_the_latency_and_what_is_known_of_it() -> None:

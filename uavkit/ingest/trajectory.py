@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from uavkit.core.arrays import Array, Flags, Indices
 from uavkit.core.errors import InputError
 from uavkit.core.flight_log import FixTable, FixType
-from uavkit.core.frames import LocalFrame
+from uavkit.core.frames import LocalFrame, geoid_undulation_m
 from uavkit.core.gpstime import NO_TIME
 from uavkit.core.heights import HeightDatum
 from uavkit.core.records import GnssFix
@@ -28,6 +28,8 @@ DISBELIEVED = 0.5
 """Velocities that differ from the way between fixes by this share of it, in the median, are none of this flight."""
 BOUND_SHARE = 1.0 / 3.0
 """Of the bound of the interpolation that counts as its sigma: errors hardly ever pass the bound."""
+MOST_OFF_UNDULATION_M = 10.0
+"""Receivers' geoids are coarse: within this of EGM96, their undulation is believed."""
 LEAST_SPEED_M_S = 0.5
 """Slower than this, velocities are not judged."""
 
@@ -222,13 +224,14 @@ class Trajectory:
 def build_trajectory(table: FixTable, options: TrajectoryOptions = TrajectoryOptions()) -> Trajectory:
     """Return the trajectory of the first receiver that has fixes, or of an autopilot's own estimate.
 
-    Heights are ellipsoidal where the receiver tells them, else above the geoid, else above the take-off point. Two
-    fixes of one moment count once. Raises InputError for less than two fixes with GPS time.
+    Heights are ellipsoidal where the receiver tells them (and they are: a note says where they cannot be), else above
+    the geoid, else above the take-off point. Two fixes of one moment count once. Raises InputError for less than two
+    fixes with GPS time.
     """
     rows, notes = _rows_of_receiver(table)
     good = rows[_usable(table, rows)]
     lost_ns = _lost_times(table, rows, good)
-    datum, height_m = _heights(table, good)
+    datum, height_m = _heights(table, good, notes)
     finite = np.isfinite(height_m)
     good, height_m = good[finite], height_m[finite]
     order = np.argsort(table.when.gps_ns[good], kind="stable")
@@ -318,19 +321,40 @@ def _lost_times(table: FixTable, rows: Indices, good: Indices) -> Indices:
     return np.unique(times[times != NO_TIME])
 
 
-def _heights(table: FixTable, good: Indices) -> tuple[HeightDatum, Array]:
+def _heights(table: FixTable, good: Indices, notes: list[str]) -> tuple[HeightDatum, Array]:
     """Return the datum of the heights and the heights (k,), NaN where a fix lacks it; zeros where none has any."""
-    columns = (
+    columns = [
         (HeightDatum.ELLIPSOID, table.height_ellipsoid_m[good]),
         (HeightDatum.GEOID, table.height_geoid_m[good]),
         (HeightDatum.GROUND, table.height_above_home_m[good]),
-    )
+    ]
+    off_m = _off_the_undulation_m(table, good)
+    if off_m > MOST_OFF_UNDULATION_M:
+        notes.append(
+            f"ellipsoidal heights less those above the geoid miss the geoid's undulation by {off_m:.0f} m: those above "
+            "the geoid are used"
+        )
+        del columns[0]
     missing = [float(np.mean(~np.isfinite(height))) if len(height) else 1.0 for _, height in columns]
     for share, column in zip(missing, columns, strict=True):
         if share <= MOST_WITHOUT_HEIGHT:
             return column
     least = int(np.argmin(missing))
     return columns[least] if missing[least] < 1.0 else (HeightDatum.UNKNOWN, np.zeros(len(good)))
+
+
+def _off_the_undulation_m(table: FixTable, good: Indices) -> float:
+    """Return by how much the two heights of the fixes differ otherwise than ellipsoid and geoid do; 0 if not told.
+
+    Receivers and simulators that do not know the undulation give one height for the other.
+    """
+    undulation_m = table.height_ellipsoid_m[good] - table.height_geoid_m[good]
+    both = good[np.isfinite(undulation_m)]
+    if len(both) == 0:
+        return 0.0
+    middle = both[len(both) // 2]
+    expected_m = geoid_undulation_m(table.latitude_deg[middle : middle + 1], table.longitude_deg[middle : middle + 1])
+    return float(abs(np.nanmedian(undulation_m) - expected_m[0]))
 
 
 def _velocities(h: Array, joined: Flags, position: Array, told: Array, notes: list[str]) -> tuple[Array, Flags]:
