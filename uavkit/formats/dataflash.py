@@ -37,6 +37,7 @@ from uavkit.formats.dataflash_fields import (
     CHARACTERS,
     FMT_LENGTH,
     FMT_TYPE,
+    USED,
     WANTED,
     Definition,
     Messages,
@@ -47,7 +48,7 @@ from uavkit.formats.dataflash_fields import (
 )
 from uavkit.formats.dataflash_tables import flight_log
 from uavkit.formats.kernels import dataflash_frames as frames
-from uavkit.formats.log_bytes import BLOCK_BYTES, Blocks, DamageTally, opened
+from uavkit.formats.log_bytes import Blocks, DamageTally, opened
 
 _REASONS = {
     frames.NO_HEADER: "no message begins here",
@@ -59,6 +60,9 @@ _HEAD = b"\xa3\x95"
 _FMT_HEAD = re.compile(rb"\xa3\x95\x80[\s\S]{2}[A-Z0-9]{2,4}\0{0,2}[a-zA-Z]")
 _LEAST_HEADS = 4
 _LONGEST_MESSAGE = 255
+_PIECE = 4096
+_BLOCK_BYTES = 1024 * 1024
+"""Small, for it is the greater part of what reading takes beside the tables."""
 
 
 def recognises(head: bytes) -> bool:
@@ -68,16 +72,20 @@ def recognises(head: bytes) -> bool:
 
 def read_log(path: Path, progress: Progress = silent) -> FlightLog:
     """Read a dataflash log; raises InputError where the file cannot be read or no message is in it."""
-    return flight_log(read_messages(path, WANTED, progress), str(path), LogKind.DATAFLASH)
+    return flight_log(_read(path, WANTED, progress, _BLOCK_BYTES).messages(USED), str(path), LogKind.DATAFLASH)
 
 
 def read_messages(
-    path: Path, names: frozenset[str] = WANTED, progress: Progress = silent, block_bytes: int = BLOCK_BYTES
+    path: Path, names: frozenset[str] = WANTED, progress: Progress = silent, block_bytes: int = _BLOCK_BYTES
 ) -> Messages:
     """Return the messages of some names with all their columns, and counts and damage of all.
 
     Raises InputError where the file cannot be read or no message is in it.
     """
+    return _read(path, names, progress, block_bytes).messages()
+
+
+def _read(path: Path, names: frozenset[str], progress: Progress, block_bytes: int) -> "_Scan":
     size = path.stat().st_size if path.is_file() else 0
     with opened(path) as stream:
         scan = _scanned(stream, _Scan(names), progress, size, block_bytes)
@@ -89,7 +97,7 @@ def read_messages(
             f"{path}: holds no definitions of messages (FMT), without which a dataflash log cannot be read: "
             "download it again from its beginning"
         )
-    return scan.messages()
+    return scan
 
 
 def _scanned(stream: BinaryIO, scan: "_Scan", progress: Progress, size: int, block_bytes: int) -> "_Scan":
@@ -149,14 +157,14 @@ class _Scan:
             self._end, self._state[frames.END] = offset + int(self._state[frames.END]), 0
         return p if not final else len(block)
 
-    def messages(self) -> Messages:
-        """Return what was found."""
+    def messages(self, columns: frozenset[str] | None = None) -> Messages:
+        """Return what was found, with all columns or some by name; what it was found in is given up."""
         self._count_all()
         parts: dict[str, list[Rows]] = defaultdict(list)
         for definition in list(self._gathered):
             taken = self._gathered.pop(definition)
             places, rows = np.concatenate(taken.places), np.concatenate(taken.rows)
-            parts[definition.name].append(Rows(places=places, columns=definition.columns_of(rows)))
+            parts[definition.name].append(Rows(places=places, columns=definition.columns_of(rows, columns)))
         return Messages(
             rows={name: joined(rows) for name, rows in parts.items()},
             counts=dict(self._counts),
@@ -238,9 +246,11 @@ class _Scan:
         if block[-1] != 0:
             self._zeros_from = self._size
             return
-        filled = np.flatnonzero(block)
-        if len(filled):
-            self._zeros_from = offset + int(filled[-1]) + 1
+        for end in range(len(block), 0, -_PIECE):
+            filled = np.flatnonzero(block[max(0, end - _PIECE) : end])
+            if len(filled):
+                self._zeros_from = offset + max(0, end - _PIECE) + int(filled[-1]) + 1
+                return
 
     def _last_notes(self) -> list[str]:
         notes = [

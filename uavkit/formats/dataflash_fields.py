@@ -43,6 +43,14 @@ CHARACTERS: Mapping[str, tuple[str, float]] = {
     "Q": ("<u8", 1.0),
 }
 """Type of a column by its character, and by what it is divided."""
+USED = frozenset(
+    [
+        "TimeUS", "TimeMS", "T", "I", "Status", "GMS", "GWk", "Week", "NSats", "Lat", "Lng", "Alt", "RelAlt", "RAlt",
+        "RelHomeAlt", "Spd", "GCrs", "VZ", "HAcc", "VAcc", "VV", "SMS", "AEl", "Und", "Roll", "Pitch", "Yaw",
+        "R", "P", "Y", "Img", "Name", "Value", "Message",
+    ]
+)  # fmt: skip
+"""Columns that end up in tables."""
 TEXT_CHARACTERS = frozenset("nNZ")
 WANTED = frozenset({"CAM", "TRIG", "GPS", "GPS2", "GPSB", "GPA", "GPA2", "GPAB", "POS", "ATT", "MSG", "PARM"})
 
@@ -93,11 +101,13 @@ class Definition:
             at += size_of(character)
         return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": self.length})
 
-    def columns_of(self, rows: NDArray[np.uint8]) -> dict[str, Column]:
-        """Return the columns of messages (n, length) in whole units, each (n,) or (n, 32)."""
+    def columns_of(self, rows: NDArray[np.uint8], only: frozenset[str] | None = None) -> dict[str, Column]:
+        """Return the columns of messages (n, length) in whole units, each (n,) or (n, 32); all, or some by name."""
         table = np.ascontiguousarray(rows).reshape(-1).view(self.dtype())
         scaled = dict[str, Column]()
         for column, character in self.pairs:
+            if only is not None and column not in only:
+                continue
             divisor = CHARACTERS[character][1]
             raw = table[column]
             scaled[column] = raw.astype(np.float64) / divisor if divisor != 1.0 else raw.copy()

@@ -165,6 +165,9 @@ def scan(
         if found == len(places) or lost >= len(spans) - 1:
             reason = FULL
             break
+        if state[SYNCHRONISED] == 1 and frame_length(data, p, tables[0]) > 0 and tables[3, data[p + 2]] == STOP_BEFORE:
+            reason = CONTESTED
+            break
         refused = refusal(data, p, tables, state)
         if refused != 0:
             if begin < 0:
@@ -174,9 +177,6 @@ def scan(
             continue
         kind = data[p + 2]
         todo = tables[3, kind]
-        if todo == STOP_BEFORE:
-            reason = CONTESTED
-            break
         if begin >= 0:
             spans[lost, 0], spans[lost, 1], spans[lost, 2] = begin, p - begin, why
             lost += 1
