@@ -252,7 +252,7 @@ def test_nothing_of_use_is_an_error(tmp_path: Path) -> None:
             read(tmp_path, data)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(st.lists(st.sampled_from(["GGA", "RMC", "GLL", "GNS", "ZDA", "GST", "VTG", "GSA"]), min_size=1), st.data())
 def test_any_fields_are_read(tmp_path_factory: pytest.TempPathFactory, kinds: list[str], data: st.DataObject) -> None:
     """Intact sentences that tell nonsense."""

@@ -201,3 +201,37 @@ def test_file_without_a_message_is_an_error(tmp_path: Path) -> None:
             read(tmp_path, data)
     with pytest.raises(InputError, match="cannot be read"):
         ubx.read_log(tmp_path / "none.ubx", silent)
+
+
+def test_solution_alone_gives_its_geocentric_position(tmp_path: Path) -> None:
+    import pyproj
+
+    to_ecef = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    for latitude, longitude, height_m in ((53.36, -2.31, 112.7), (-35.6, 139.7, 4000.0), (0.0, 180.0, -30.0)):
+        ecef = np.round(np.array(to_ecef.transform(longitude, latitude, height_m)) * 100).astype(int).tolist()
+        payload = struct.pack("<IihBB3iI3iIHBBI", 5000, 0, made.WEEK, 3, 0x0D, *ecef, 300, 0, 0, 0, 50, 150, 0, 9, 0)
+        table = read(tmp_path, made.ubx(0x01, 0x06, payload)).fix_table
+        assert table.latitude_deg == pytest.approx(latitude, abs=1e-7)
+        assert abs(table.longitude_deg[0]) == pytest.approx(abs(longitude), abs=1e-7)
+        assert table.height_ellipsoid_m == pytest.approx(height_m, abs=0.01)
+        assert np.isnan(table.height_geoid_m).all()
+        assert table.sigma_horizontal_m == pytest.approx(3.0 / 3**0.5)
+        assert table.sigma_vertical_m == pytest.approx(3.0 / 3**0.5)
+    table = read(tmp_path, made.sol(5000, 0, made.WEEK, 0, 0)).fix_table
+    assert np.isnan(table.latitude_deg).all()
+
+
+def test_invalid_precise_position_gives_way_to_the_other(tmp_path: Path) -> None:
+    table = read(tmp_path, made.pvt(0), made.hpposllh(0, (0, 0, 0, 0), (0, 0, 0, 0), (0, 0), flags=1)).fix_table
+    assert table.latitude_deg.tolist() == [35.6]
+    assert table.sigma_vertical_m.tolist() == [2.5]
+
+
+def test_progress_ends_with_the_file(tmp_path: Path) -> None:
+    calls: list[tuple[str, int, int]] = []
+    path = tmp_path / "receiver.ubx"
+    path.write_bytes(made.pvt(0) * 3 + b"rest")
+    ubx.read_log(path, lambda *call: calls.append(call))
+    total = path.stat().st_size
+    assert calls[-1] == ("reading", total, total)
+    assert all(done <= total for _, done, _ in calls)

@@ -184,7 +184,7 @@ def test_recognised_by_content() -> None:
     assert not ubx.recognises(rng.bytes(30_000) + made.pvt(0) + rng.bytes(30_000)), "a frame inside another log"
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(st.binary(max_size=400), st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 255)), max_size=8))
 def test_any_bytes_are_read_or_refused(tmp_path_factory: pytest.TempPathFactory, noise: bytes, hits: list) -> None:  # type: ignore[type-arg]
     base = bytearray(mixed_stream(np.random.default_rng(9), 12) + noise)

@@ -110,6 +110,7 @@ def test_date_from_timeutc_of_the_same_epoch(tmp_path: Path) -> None:
         made.posllh(5000, 1, 2, (3, 4), (5, 6)) + made.sol(5000, 0, made.WEEK, 3, 0x01),
         made.posllh(5000, 1, 2, (3, 4), (5, 6)) + made.sol(5000, 0, made.WEEK, 3, 0x09),
         made.posllh(5000, 1, 2, (3, 4), (5, 6)) + made.sol(5000, 0, 0, 3, 0x0D),
+        made.posllh(5000, 1, 2, (3, 4), (5, 6)) + made.sol(5000, 0, 32_000, 3, 0x0D),
         made.posllh(5000, 1, 2, (3, 4), (5, 6)) + made.timegps(5000, 0, made.WEEK, 18, valid=1),
         made.posllh(5000, 1, 2, (3, 4), (5, 6)) + made.timeutc(5000, (2026, 1, 4, 0, 0, 0), 0, valid=1),
         made.posllh(5000, 1, 2, (3, 4), (5, 6)),

@@ -13,16 +13,11 @@ from uavkit.core.progress import Progress
 from uavkit.formats.log_bytes import DamageTally, opened
 from uavkit.formats.nmea_epochs import Sentences
 from uavkit.formats.receiver_stream import NMEA, UBX, Batch, batches, name_of_rtcm, name_of_sentence
-from uavkit.formats.ubx_epochs import (
-    POSITIONED,
-    Messages,
-    epoch_times,
-    fix_types,
-    joined_epochs,
-    ubx_fixes,
-)
+from uavkit.formats.ubx_epochs import Messages, fix_types, joined_epochs
 from uavkit.formats.ubx_marks import ubx_marks
 from uavkit.formats.ubx_messages import DECODED, MON_VER, NAMES, name_of_frame
+from uavkit.formats.ubx_positions import ubx_fixes
+from uavkit.formats.ubx_times import epoch_times
 
 _INFORMATION = (0x0400, 0x0401, 0x0402)
 _MOST_TEXTS = 1000
@@ -107,13 +102,14 @@ def read_receiver_log(path: Path, progress: Progress) -> FlightLog:
         for batch in batches(stream, tally):
             collector.add(batch)
             progress("reading", min(batch.offset + len(batch.block), total), total)
+    progress("reading", total, total)
     if not collector.counts:
         raise InputError(f"{path}: has no intact u-blox frame and no NMEA sentence: is it the receiver's recording?")
     messages = collector.messages()
     epochs = joined_epochs(messages)
     fixes = fix_types(messages, epochs)
     times = epoch_times(messages, epochs, fixes)
-    table = ubx_fixes(messages, epochs, times, fixes) if any(kind in messages for kind in POSITIONED) else no_fixes()
+    table = ubx_fixes(messages, epochs, times, fixes)
     exposures, notes = no_exposures(), times.notes
     if "TIM-TM2" in messages:
         exposures, mark_notes = ubx_marks(messages["TIM-TM2"], epochs, times)

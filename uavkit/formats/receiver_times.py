@@ -18,6 +18,8 @@ SECOND_NS = 1_000_000_000
 DAY_NS = 86_400 * SECOND_NS
 ROLL_OVER_NS = 1024 * WEEK_NS
 """GPS satellites tell the week modulo 1024; firmware that is too old for the flight gives dates 1024 weeks early."""
+LAST_WEEK = 10_000
+"""Of the year 2171: a week beyond is none (and has no place in 64 bits of nanoseconds)."""
 EARLIEST_NS = gps_time_ns_from_utc(datetime(2005, 1, 1, tzinfo=UTC))
 """No camera drone's log is older: a date before it has rolled over (or is the receiver's own before a fix)."""
 EARLIEST_PVT_NS = gps_time_ns_from_utc(datetime(2012, 1, 1, tzinfo=UTC))

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from uavkit.core.arrays import Array, Indices
 from uavkit.core.flight_log import ExposureKind, ExposureTable, Stamps, exposure_table, no_exposures
 from uavkit.core.gpstime import NO_TIME, WEEK_NS
-from uavkit.formats.receiver_times import SECOND_NS, dated_leap_seconds, roll_over_note, unrolled
-from uavkit.formats.ubx_epochs import NO_COUNT, Epochs, EpochTimes, Messages
+from uavkit.formats.receiver_times import LAST_WEEK, SECOND_NS, dated_leap_seconds, roll_over_note, unrolled
+from uavkit.formats.ubx_epochs import Epochs, Messages
+from uavkit.formats.ubx_times import NO_COUNT, EpochTimes
 
 RISING, FALLING = "R", "F"
 _NEW_FALLING, _UTC_KNOWN, _TIME_VALID, _NEW_RISING = 4, 32, 64, 128
@@ -100,7 +101,8 @@ def _times(marks: _Marks, epochs: Epochs, times: EpochTimes) -> tuple[Indices, i
     """Return GPS times of marks, (n,), NO_TIME where the receiver does not know, and how many had rolled over."""
     rows, base = marks.rows, _base(marks.rows)
     time = _edge_ns(rows, marks.edge)
-    valid = (rows["flags"] & _TIME_VALID > 0) & (time >= WEEK_NS)
+    week = rows["wn" + marks.edge]
+    valid = (rows["flags"] & _TIME_VALID > 0) & (week > 0) & (week <= LAST_WEEK)
     valid &= (base != _UTC_TIME) | (rows["flags"] & _UTC_KNOWN > 0)
     leap = _receiver_leaps(marks.offsets, time, epochs, times)
     gps_ns = np.where(valid, time + np.where(base == _UTC_TIME, leap * SECOND_NS, 0), NO_TIME)
