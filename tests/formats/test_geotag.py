@@ -240,6 +240,14 @@ def test_stills_of_a_drone_keep_all_their_other_tags(tmp_path: Path) -> None:
     assert set(warnings_of(copies[0])) <= set(warnings_of(sources[0]))
 
 
+def test_a_still_without_exif_keeps_its_resolution(tmp_path: Path) -> None:
+    for name, options in {"a.jpg": {"dpi": (300, 300)}, "b.jpg": {}, "c.png": {"dpi": (300, 300)}}.items():
+        Image.fromarray(picture()).save(tmp_path / name, **options)  # type: ignore[arg-type]
+        with Image.open(tmp_path / name) as before, Image.open(geotagged(tmp_path / name, tag())) as after:
+            assert after.info.get("dpi", (72, 72)) == before.info.get("dpi", (72, 72))
+            assert after.getexif().get(0x11A) == {"a.jpg": 300, "b.jpg": 72}.get(name)
+
+
 def test_old_tags_of_the_position_go_and_those_of_the_motion_stay(tmp_path: Path) -> None:
     source = write_still(tmp_path / "a.jpg", exif=exif_block(">", gps=old_gps(">")))
     with Image.open(geotagged(source, tag())) as image:

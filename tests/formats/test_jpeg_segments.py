@@ -13,12 +13,14 @@ from uavkit.formats.jpeg_segments import (
     APP1,
     APP2,
     EXIF_HEADER,
+    JFIF_HEADER,
     LARGEST_PAYLOAD,
     MPF_HEADER,
     XMP_HEADER,
     encode_segment,
     read_segments,
     rebuilt,
+    resolution,
 )
 from uavkit.formats.pieces import Copied, joined, write_pieces
 
@@ -59,7 +61,7 @@ def test_segments_tell_where_they_stand_and_keep_only_what_geotags_concern() -> 
     assert [s.end - s.start for s in found] == [len(part) for part in parts]
     assert found[0].start == 2
     assert all(a.end == b.start for a, b in itertools.pairwise(found))
-    assert [s.payload for s in found] == [None, EXIF_HEADER + b"abc", None, None, XMP_HEADER + b"<x/>", None]
+    assert [s.payload for s in found] == [JFIF_HEADER, EXIF_HEADER + b"abc", None, None, XMP_HEADER + b"<x/>", None]
 
 
 @pytest.mark.parametrize(
@@ -149,6 +151,17 @@ def test_a_segment_holds_so_much_and_no_more() -> None:
     assert len(encode_segment(APP1, bytes(LARGEST_PAYLOAD), "x")) == 65_537
     with pytest.raises(InputError, match=r"still.jpg: its XMP segment .*\(1 bytes\) does not fit"):
         encode_segment(APP1, XMP_HEADER + bytes(LARGEST_PAYLOAD - len(XMP_HEADER) + 1), "still.jpg")
+
+
+@pytest.mark.parametrize(
+    "density, expected",
+    [(b"\1\1\1\x01\x2c\x00\x96", (300, 150, 2)), (b"\1\1\2\0\x76\0\x76", (118, 118, 3))]
+    + [(wrong, (72, 72, 2)) for wrong in (b"\1\1\0\0\1\0\1", b"\1\1\1\0\0\0\0", b"\1\1", b"\1\1\7\1\1\1\1")],
+)
+def test_resolution_is_that_of_jfif(density: bytes, expected: tuple[int, int, int]) -> None:
+    data = b"\xff\xd8" + segment(0xE0, b"JFIF\0" + density) + SCAN
+    assert resolution(read_segments(io.BytesIO(data), "x")) == expected
+    assert resolution(()) == (72, 72, 2)
 
 
 def test_neighbouring_ranges_are_copied_as_one() -> None:

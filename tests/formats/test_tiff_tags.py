@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from tests.formats.geotag_stills import exif_block, old_gps
 from uavkit.core.errors import InputError
-from uavkit.formats.tiff_tags import EMPTY_BLOCK, Field, TagBlock, without
+from uavkit.formats.tiff_tags import EMPTY_BLOCK, Field, TagBlock, block_of_resolution, without
 
 NEW = [Field.text(1, "S"), Field.of_bytes(0, b"\2\3\0\0"), Field.undefined(27, b"odd")]
 
@@ -31,7 +31,7 @@ def test_fields_are_found_again_in_the_order_of_their_tags(order: str, gps: bool
 
 @pytest.mark.parametrize("odd", [b"", b"x"])
 def test_directories_and_values_stand_at_even_offsets(odd: bytes) -> None:
-    block = EMPTY_BLOCK + odd
+    block = block_of_resolution(300, 150, 2) + odd
     new = edited(block, [Field.text(1, "seven b"), Field.undefined(2, b"odd:x"), Field.text(3, "after it")])
     (first,) = struct.unpack_from("<I", new, 4)
     rows = dict(struct.unpack_from("<H6xI", new, first + 2 + 12 * i) for i in range(5))

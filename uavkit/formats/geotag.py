@@ -26,7 +26,7 @@ from uavkit.formats import png_chunks as png
 from uavkit.formats import xmp_packet
 from uavkit.formats.atomic import atomic_path
 from uavkit.formats.pieces import write_pieces
-from uavkit.formats.tiff_tags import EMPTY_BLOCK, Field, TagBlock, without
+from uavkit.formats.tiff_tags import EMPTY_BLOCK, Field, TagBlock, block_of_resolution, without
 
 PIX4D_CAMERA = "http://pix4d.com/camera/1.0/"
 UAVKIT = "urn:uavkit:geotag:1.0/"
@@ -162,8 +162,7 @@ def _writer(head: bytes, source: Path) -> Callable[[BinaryIO, BinaryIO, GeoTag, 
 def _write_jpeg(source: BinaryIO, copy: BinaryIO, tag: GeoTag, name: str) -> None:
     segments = jpeg.read_segments(source, name)
     old_exif, old_xmp = _payload(segments, jpeg.EXIF_HEADER), _payload(segments, jpeg.XMP_HEADER)
-    block = TagBlock.of_bytes(old_exif or EMPTY_BLOCK, name)
-    exif = block.with_fields(gps_fields(tag, block), None).applied(old_exif or EMPTY_BLOCK)
+    exif = _with_gps(old_exif or block_of_resolution(*jpeg.resolution(segments)), tag, name)
     packet = xmp_packet.merged(old_xmp, xmp_properties(tag), _PREFIXES, name)
     packet = _fitted(packet, _growth(old_exif, exif, jpeg.EXIF_HEADER) + _growth(old_xmp, packet, jpeg.XMP_HEADER))
     changed, added = {}, []
@@ -176,6 +175,11 @@ def _write_jpeg(source: BinaryIO, copy: BinaryIO, tag: GeoTag, name: str) -> Non
         elif payload:
             added.append((first, jpeg.encode_segment(jpeg.APP1, header + payload, name)))
     write_pieces(source, jpeg.rebuilt(segments, changed, added), copy)
+
+
+def _with_gps(exif: bytes, tag: GeoTag, name: str) -> bytes:
+    block = TagBlock.of_bytes(exif, name)
+    return block.with_fields(gps_fields(tag, block), None).applied(exif)
 
 
 def _growth(old: bytes | None, new: bytes, header: bytes) -> int:
@@ -220,8 +224,7 @@ def _write_tiff(source: BinaryIO, copy: BinaryIO, tag: GeoTag, name: str) -> Non
 def _write_png(source: BinaryIO, copy: BinaryIO, tag: GeoTag, name: str) -> None:
     chunks = png.read_chunks(source, name)
     old_exif, old_xmp = png.payload(chunks, png.EXIF, name), png.payload(chunks, png.XMP, name)
-    block = TagBlock.of_bytes(old_exif or EMPTY_BLOCK, name)
-    new = {png.EXIF: block.with_fields(gps_fields(tag, block), None).applied(old_exif or EMPTY_BLOCK)}
+    new = {png.EXIF: _with_gps(old_exif or EMPTY_BLOCK, tag, name)}
     packet = xmp_packet.merged(old_xmp, xmp_properties(tag), _PREFIXES, name)
     if packet != (old_xmp or b""):
         new[png.XMP] = packet

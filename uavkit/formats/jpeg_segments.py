@@ -17,9 +17,11 @@ APP0, APP1, APP2 = 0xE0, 0xE1, 0xE2
 EXIF_HEADER = b"Exif\0\0"
 XMP_HEADER = b"http://ns.adobe.com/xap/1.0/\0"
 MPF_HEADER = b"MPF\0"
+JFIF_HEADER = b"JFIF\0"
 LARGEST_PAYLOAD = 0xFFFF - 2
 """Bytes that a segment holds beside its marker and its length."""
 
+_KEPT = {APP0: (JFIF_HEADER,), APP1: (EXIF_HEADER, XMP_HEADER), APP2: (MPF_HEADER,)}
 _SOI, _EOI, _SOS, _TEM = 0xD8, 0xD9, 0xDA, 0x01
 _MOST_SEGMENTS = 100_000
 """Thermal cameras keep megabytes in segments (some hundreds); beyond this the file is made to exhaust the reader."""
@@ -70,7 +72,7 @@ def _next_segment(stream: BinaryIO, start: int, name: str) -> Segment | None:
     payload = stream.read(max(length - 2, 0))
     if length < 2 or len(payload) < length - 2:
         raise InputError(f"{name}: damaged or cut short: the segment at byte {start} does not end within the file")
-    kept = marker in (APP1, APP2) and payload.startswith((EXIF_HEADER, XMP_HEADER, MPF_HEADER))
+    kept = marker in _KEPT and payload.startswith(_KEPT[marker])
     end = start + fill + 1 + length
     return Segment(marker=marker, start=start, end=end, payload=payload if kept else None)
 
@@ -87,6 +89,15 @@ def _marker(stream: BinaryIO, start: int, name: str) -> tuple[int, int]:
     if fill == 0 or byte == b"\0":
         raise InputError(f"{name}: damaged: no segment begins at byte {start}")
     return byte[0], fill
+
+
+def resolution(segments: Sequence[Segment]) -> tuple[int, int, int]:
+    """Return points per unit, x and y, and EXIF's code of the unit, of JFIF's header; 72 per inch where unknown."""
+    head = next((segment.payload for segment in segments if segment.holds(JFIF_HEADER)), None) or b""
+    if len(head) < 12 or head[7] not in (1, 2):
+        return 72, 72, 2
+    x, y = struct.unpack(">HH", head[8:12])
+    return (x, y, head[7] + 1) if x and y else (72, 72, 2)
 
 
 def encode_segment(marker: int, payload: bytes, name: str) -> bytes:

@@ -16,16 +16,8 @@ GPS_POINTER = 0x8825
 XMP_TAG = 700
 BYTE, ASCII, LONG, RATIONAL = 1, 2, 4, 5
 SHORT, UNDEFINED = 3, 7
-EMPTY_BLOCK = (
-    struct.pack("<2sHIH", b"II", 42, 8, 4)
-    + struct.pack("<HHII", 0x11A, RATIONAL, 1, 62)
-    + struct.pack("<HHII", 0x11B, RATIONAL, 1, 70)
-    + struct.pack("<HHII", 0x128, SHORT, 1, 2)
-    + struct.pack("<HHII", 0x213, SHORT, 1, 1)
-    + struct.pack("<IIIII", 0, 72, 1, 72, 1)
-)
-"""An EXIF block that says nothing: the four tags that EXIF demands (72 points per inch where the resolution is
-unknown, colour samples centred) and no next directory. A still without EXIF is given it."""
+EMPTY_BLOCK = struct.pack("<2sHIHI", b"II", 42, 8, 0, 0)
+"""An EXIF block that says nothing: one directory without fields, and no next one."""
 
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}
 """Bytes of one value by its type."""
@@ -241,6 +233,16 @@ class _Tail:
         offset = self._start + len(self.data)
         self.data += data + bytes(len(data) % 2)
         return min(offset, _LARGEST_TIFF)  # beyond it the caller, who knows the file's name, refuses
+
+
+def block_of_resolution(x: int, y: int, unit: int) -> bytes:
+    """Return the EXIF block that a JPEG without one is given: the four tags that EXIF demands and nothing else.
+
+    Points per unit, unit 2 (inch) or 3 (cm); colour samples centred, EXIF's default.
+    """
+    fields = struct.pack("<HHII", 0x11A, RATIONAL, 1, 62) + struct.pack("<HHII", 0x11B, RATIONAL, 1, 70)
+    fields += struct.pack("<HHII", 0x128, SHORT, 1, unit) + struct.pack("<HHII", 0x213, SHORT, 1, 1)
+    return struct.pack("<2sHIH", b"II", 42, 8, 4) + fields + struct.pack("<IIIII", 0, x, 1, y, 1)
 
 
 def without(fields: Sequence[Field], tags: set[int]) -> list[Field]:
