@@ -29,7 +29,7 @@ from uavkit.core.arrays import Array
 from uavkit.core.errors import InputError
 from uavkit.core.gpstime import gps_time_ns_from_utc, utc_from_gps_time_ns
 from uavkit.core.heights import HeightDatum
-from uavkit.formats.exif import read_header
+from uavkit.formats.exif import parse_drone_tags, read_header
 from uavkit.formats.geotag import GeoTag, write_geotagged, yaw_pitch_roll_deg
 from uavkit.formats.jpeg_segments import read_segments
 
@@ -343,6 +343,18 @@ def test_accuracy_and_datum_are_read_back_also_from_a_copy_of_an_rtk_still(tmp_p
     assert fix.height_datum is HeightDatum.GEOID
     assert (fix.sigma_horizontal_m, fix.sigma_vertical_m) == (0.0142, 0.03)
     assert 'rdf:about="DJI Meta Data" xmlns:Camera' in " ".join(xmp_of(copy).split())
+
+
+def test_accuracies_of_other_programs_are_read_in_both_forms() -> None:
+    elements = "<Camera:VertCS>ellipsoidal</Camera:VertCS><Camera:GPSXYAccuracy>1.2</Camera:GPSXYAccuracy>"
+    for text in (
+        elements,
+        "Camera:VertCS=\"ellipsoidal\" Camera:GPSXYAccuracy = '1.2'",
+        elements + '<Camera:VertCS x="',
+    ):
+        tags = parse_drone_tags(text)
+        assert (tags.camera_vertical_crs, tags.camera_sigma_horizontal_m) == ("ellipsoidal", 1.2)
+        assert tags.camera_sigma_vertical_m is None
 
 
 def test_tagging_again_leaves_one_position(tmp_path: Path) -> None:
