@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.formats.log_damage import damaged
+from tests.formats.log_damage import Damaged, damaged
 from tests.formats.tlog_bytes import LAYOUTS, Sender, frame, record
 from uavkit.core.errors import InputError
 from uavkit.core.flight_log import FlightLog
@@ -86,13 +86,17 @@ def check(log: FlightLog, data: bytes, whole: dict[tuple[int, int], str]) -> Non
             assert span.offset + span.length <= begin or span.offset >= end
 
 
-def whole_frames(intact: tuple[tuple[int, int, int], ...], messages: list[Message]) -> dict[tuple[int, int], str]:
-    """Return what lies whole in a damaged log, twice where it is repeated."""
+def whole_frames(hurt: Damaged, data: bytes, messages: list[Message]) -> dict[tuple[int, int], str]:
+    """Return what of an intact log lies whole in the damaged one, twice where it is repeated.
+
+    By its bytes: damage may put back what it took, zeros for zeros, or the end of one message for another's.
+    """
     return {
         (message.begin + offset, message.end + offset): message.name
-        for first, last, offset in intact
+        for offset in {offset for _, _, offset in hurt.intact}
         for message in messages
-        if first <= message.begin and message.end <= last
+        if message.begin + offset >= 0
+        and hurt.data[message.begin + offset : message.end + offset] == data[message.begin : message.end]
     }
 
 
@@ -101,7 +105,7 @@ def run_damages(data: bytes, path: Path, rng: np.random.Generator, count: int) -
     for _ in range(count):
         hurt = damaged(data, rng)
         path.write_bytes(hurt.data)
-        check(tlog.read_log(path), hurt.data, whole_frames(hurt.intact, messages))
+        check(tlog.read_log(path), hurt.data, whole_frames(hurt, data, messages))
 
 
 def contents(data: bytes, whole: dict[tuple[int, int], str], name: str, part: slice) -> set[bytes]:
@@ -125,7 +129,7 @@ def test_content_of_what_damage_did_not_touch(tmp_path: Path) -> None:
     for _ in range(30):
         hurt = damaged(data, rng)
         path.write_bytes(hurt.data)
-        log, whole = tlog.read_log(path), whole_frames(hurt.intact, messages)
+        log, whole = tlog.read_log(path), whole_frames(hurt, data, messages)
         rolls = {np.float32(roll).tobytes() for roll in log.attitude_table.roll_rad}
         assert rolls == contents(hurt.data, whole, "ATTITUDE", slice(4, 8))
         numbers = {int(n).to_bytes(2, "little") for n in log.exposure_table.sequence}
@@ -158,6 +162,31 @@ def test_damage_of_recorded_logs_at_length(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("sender", [Sender(), Sender(version=1)], ids=["v2", "v1"])
 def test_damage_of_made_logs_at_length(tmp_path: Path, sender: Sender) -> None:
     run_damages(made_log(3, sender), tmp_path / "damaged.tlog", np.random.default_rng(15), 1000)
+
+
+def test_damage_of_raw_streams(tmp_path: Path) -> None:
+    stamped = made_log(18, Sender())
+    frames = [stamped[m.begin : m.end] for m in walked(stamped)]
+    ends = np.cumsum([len(f) for f in frames]).tolist()
+    names = [m.name for m in walked(stamped)]
+    messages = [Message(begin=e - len(f), end=e, name=n) for e, f, n in zip(ends, frames, names, strict=True)]
+    data, rng, path = b"".join(frames), np.random.default_rng(19), tmp_path / "damaged.raw"
+    for _ in range(40):
+        hurt = damaged(data, rng)
+        path.write_bytes(hurt.data)
+        log, whole = tlog.read_log(path), whole_frames(hurt, data, messages)
+        names = list(whole.values())
+        assert log.message_counts == {name: names.count(name) for name in set(names)}
+        assert log.damage.lost_bytes == len(hurt.data) - sum(end - begin for begin, end in whole)
+
+
+def test_padding_with_zeros_is_lost_quickly(tmp_path: Path) -> None:
+    data, path = made_log(20, Sender()), tmp_path / "padded.tlog"
+    path.write_bytes(data + bytes(30_000_000) + data)
+    log = tlog.read_log(path)
+    assert log.damage.lost_bytes == 30_000_000
+    assert log.damage.span_count == 1
+    assert sum(log.message_counts.values()) == 320
 
 
 def test_every_place_of_a_cut_at_the_end(tmp_path: Path) -> None:

@@ -41,8 +41,8 @@ _WHY = {
 }
 _JUMP_NS = 3_600_000_000_000
 _DOUBLE_NS = 1_000_000_000
-_DOUBLE_BYTES = 65_536
-"""Without stamps: so close in the file two copies of a message must be."""
+_DOUBLE_BYTES = 262_144
+"""So close in the file two copies of a message must be."""
 _FACTOR = np.uint64(0x9E3779B97F4A7C15)
 _SHIFT = np.uint64(29)
 
@@ -140,12 +140,12 @@ class _Scan:
 
 def frames_in(head: bytes) -> Indices:
     """Return the known messages among the first bytes of a file, (k, 3): first byte, end, stamp (-1 without one)."""
-    return _look(head)[0]
+    return _look(head, STAMP_BYTES)[0]
 
 
-def _look(head: bytes) -> tuple[Indices, NDArray[np.int16]]:
+def _look(head: bytes, stamp_bytes: int) -> tuple[Indices, NDArray[np.int16]]:
     """Return ``frames_in``, and the checksum bytes (ids,), also of messages that no dialect defines."""
-    scan = _Scan(STAMP_BYTES, np.flatnonzero(dialect().crc_extra >= 0))
+    scan = _Scan(stamp_bytes, np.flatnonzero(dialect().crc_extra >= 0))
     block = np.frombuffer(head, dtype=np.uint8).copy()  # as blocks are, so that the scan is compiled once
     rows = scan.block(block, len(block) <= 4 * MARGIN_BYTES, 1).rows
     known = rows[rows[:, 0] < len(scan.extra)]
@@ -157,11 +157,13 @@ def scan_log(path: Path, progress: Progress) -> RawLog:
     with opened(path) as stream:
         size = stream.seek(0, SEEK_END)
         stream.seek(0)
-        head, extra = _look(stream.read(_HEAD_BYTES))
-        stamped = 2 * int(np.sum(head[:, 2] >= 0)) >= len(head)
+        head = stream.read(_HEAD_BYTES)
         stream.seek(0)
-        scan = _Scan(STAMP_BYTES if stamped else 0, np.array(list(FIELDS), dtype=np.int64))
-        scan.extra[:] = extra
+        frames = frames_in(head)
+        stamped = 2 * int(np.sum(frames[:, 2] >= 0)) >= len(frames)
+        stamp_bytes = STAMP_BYTES if stamped else 0
+        scan = _Scan(stamp_bytes, np.array(list(FIELDS), dtype=np.int64))
+        scan.extra[:] = _look(head, stamp_bytes)[1]
         tally, parts = DamageTally(), dict[int, list[Rows]]()
         blocks, decided, synchronised = Blocks(stream, _BLOCK_BYTES), 0, 1
         while (block := blocks.next(decided)) is not None:
@@ -244,8 +246,8 @@ def host_jumps(rows: Rows) -> int:
 def first_copies(rows: Rows, anywhere: bool = False) -> Flags:
     """Return a mask (n,) without the rows that repeat another's payload and sender.
 
-    ``anywhere``: however far apart; otherwise within a second (without stamps: within 64 KiB). A link that is received
-    twice, or a sender that repeats itself, brings such copies; payloads contain the time, so that equal ones are one.
+    ``anywhere``: however far apart; otherwise within a second and 256 KiB of the file. A link that is received twice,
+    or a sender that repeats itself, brings such copies; payloads contain the time, so that equal ones are one.
     """
     n = len(rows)
     key = _keys(rows)
@@ -253,7 +255,7 @@ def first_copies(rows: Rows, anywhere: bool = False) -> Flags:
     same = key[order][1:] == key[order][:-1]
     host, offset = rows.host_ns[order], rows.offset[order]
     both = (host[1:] != NO_TIME) & (host[:-1] != NO_TIME)
-    near = np.where(both, _apart(host[1:], host[:-1], both) < _DOUBLE_NS, np.diff(offset) < _DOUBLE_BYTES)
+    near = (_apart(host[1:], host[:-1], both) < _DOUBLE_NS) & (np.diff(offset) < _DOUBLE_BYTES)
     first = np.ones(n, dtype=np.bool_)
     first[order[1:][same & (near | anywhere)]] = False
     return first

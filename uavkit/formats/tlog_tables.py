@@ -48,6 +48,8 @@ from uavkit.formats.tlog_times import (
 PX4 = 12
 FEEDBACK_SIGMA_S = 0.001
 """Of a flash contact seen by an autopilot, which looks at its pin from an interrupt or once a millisecond."""
+TRIGGER_SIGMA_S = 0.05
+"""Of a command to the shutter: how its delay differs from one exposure to the next, where nothing measures it."""
 RECEPTION_SIGMA_S = 0.5
 """Of an exposure of which no more is known than when the message about it came: the delay of a telemetry radio."""
 _FAR_NS = 60_000_000_000
@@ -182,7 +184,7 @@ def _feedback(rows: Mapping[int, Rows], vehicle: VehicleTime, pilot: Pilot, note
     # ArduPilot 4.6 counts completed captures and stamps by the boot clock only where a flash contact is set up.
     contact = pilot.feedback_pin | (meaning == Meaning.BOOT) | (f["completed_captures"] > 0)
     kind = np.where(contact, ExposureKind.FEEDBACK, ExposureKind.TRIGGER).astype(np.uint8)
-    sigma = np.where(contact, FEEDBACK_SIGMA_S, np.nan)
+    sigma = np.where(contact, FEEDBACK_SIGMA_S, TRIGGER_SIGMA_S)
     when, sigma = _checked_times(part, (gps, boot), sigma, vehicle, rows, notes)
     _say_meaning("CAMERA_FEEDBACK", meaning, notes)
     latitude, longitude = _degrees(f["lat"], f["lng"])
@@ -211,7 +213,8 @@ def _captured(rows: Mapping[int, Rows], vehicle: VehicleTime, pilot: Pilot, note
     by_clock = vehicle.gps_ns(boot, part.offset)
     gps = _nearer_to_reception(by_utc, by_clock)
     kind = np.where(f["capture_result"] == _SUCCESS, ExposureKind.CAPTURED, ExposureKind.TRIGGER).astype(np.uint8)
-    when, sigma = _checked_times(part, (gps, boot), np.full(len(part), np.nan), vehicle, rows, notes)
+    sigma_s = np.where(kind == ExposureKind.TRIGGER, TRIGGER_SIGMA_S, np.nan)
+    when, sigma = _checked_times(part, (gps, boot), sigma_s, vehicle, rows, notes)
     latitude, longitude = _degrees(f["lat"], f["lon"])
     nowhere = np.isnan(latitude)
     above_home = np.where(nowhere | (pilot.autopilot == PX4), np.nan, _float(f["relative_alt"]) * 1e-3)
@@ -238,7 +241,8 @@ def _triggers(rows: Mapping[int, Rows], vehicle: VehicleTime, notes: list[str]) 
     part = part.where(~empty)
     gps, boot, meaning = event_times(part.fields["time_usec"], part, vehicle)
     _say_meaning("CAMERA_TRIGGER", meaning, notes)
-    when, sigma = _checked_times(part, (gps, boot), np.full(len(part), np.nan), vehicle, rows, notes)
+    sigma_s = np.full(len(part), TRIGGER_SIGMA_S)
+    when, sigma = _checked_times(part, (gps, boot), sigma_s, vehicle, rows, notes)
     sequence = part.fields["seq"].astype(np.int64)
     table = exposure_table(when, ExposureKind.TRIGGER, sigma_s=sigma, sequence=sequence)
     return _Reports(table=table, offset=part.offset, camera=np.full(len(part), -1, dtype=np.int64))
@@ -274,7 +278,7 @@ def _checked_times(
         notes.append(f"{int((timeless & ~far).sum())} exposures bear no time: time of reception used")
     sigma = np.where(timeless, RECEPTION_SIGMA_S, sigma_s)
     by_host = ~timeless & (boot != NO_TIME) & _by_host(part, vehicle)
-    sigma = np.where(by_host, _host_sigma_s(vehicle), sigma)
+    sigma = np.where(by_host, np.hypot(np.nan_to_num(sigma), _host_sigma_s(vehicle)), sigma)
     return Stamps(gps_ns=gps, boot_ns=boot, host_ns=part.host_ns), np.asarray(sigma, dtype=np.float64)
 
 

@@ -1,7 +1,7 @@
 """GPS time of what a MAVLink log records: the vehicle's boot clock, tied to GPS time session by session."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum, IntEnum
 
 import numpy as np
@@ -25,7 +25,7 @@ _FALL_NS = 5_000_000_000
 """Messages of one session come in order but for the delays of links."""
 _ROWS_BEHIND, _FEWEST_BEHIND = 4, 3
 _MOST_SESSIONS = 1000
-_MOST_PAIRS = 20_000
+_MOST_PAIRS = 5_000
 _FEWEST_PAIRS = 5
 
 
@@ -203,10 +203,10 @@ def _bent_clock(clock: ClockFit, captured: Rows, boot: Indices, host: Indices) -
     off = (dense.gps_ns(pairs_boot[inside]) - pairs_gps[inside]).astype(np.float64)
     lead = float(np.median(off))
     own = (clock.gps_ns(pairs_boot[inside]) - pairs_gps[inside]).astype(np.float64)
-    moved, _ = _host_clock(boot, host, round(lead))
-    if moved is None or 2.0 * np.median(np.abs(off - lead)) > np.median(np.abs(own)):
+    if 2.0 * np.median(np.abs(off - lead)) > np.median(np.abs(own)):
         return clock, ClockSource.CAPTURED
-    return moved, ClockSource.CAPTURED_AND_HOST
+    moved = tuple(replace(segment, offset_ns=segment.offset_ns - round(lead)) for segment in dense.segments)
+    return ClockFit(segments=moved, rejected=dense.rejected), ClockSource.CAPTURED_AND_HOST
 
 
 def event_times(
