@@ -57,13 +57,13 @@ def estimate_gnss_delay(estimates: Trajectory, fixes: Trajectory) -> GnssDelay:
     Robust least squares (Huber's weights) of estimate - fix = offset + velocity * delay in east and north, while
     the vehicle moves. Raises InputError where both have hardly such a moment in common.
     """
-    fix_m, velocity = _in_frame(fixes, estimates), fixes.velocity_m_s[:, :2]
-    delay_s = 0.0
+    fix_m, delay_s = _in_frame(fixes, estimates), 0.0
     for _ in range(_DELAY_STEPS):
         found = estimates.at(fixes.gps_ns - round(delay_s * 1e9))
+        # The estimate's own velocities: it is smooth, whereas a wrong fix spoils those of its neighbours.
+        velocity = found.velocity_m_s[:, :2]
         good = _in_motion(found, velocity)
-        difference = (found.position_m[:, :2] - fix_m)[good]
-        value, scatter_s, spread_m = _fit(velocity[good], difference)
+        value, scatter_s, spread_m = _fit(velocity[good], found.position_m[good, :2] - fix_m[good])
         delay_s += float(value[2])
         if abs(value[2]) < _STILL_S:
             break
