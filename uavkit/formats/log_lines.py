@@ -16,7 +16,7 @@ from uavkit.core.gpstime import NO_TIME, gps_time_ns_from_utc
 LONGEST_LINE = 64 * 1024
 """Bytes; what is longer is no line of a log and comes in pieces."""
 _NUMBER = re.compile(r"[+-]?(?:\d{1,40}(?:\.\d{0,40})?|\.\d{1,40})(?:[eE][+-]?\d{1,3})?")
-_SECONDS = re.compile(r"([+-]?)(\d{1,12})(?:\.(\d{1,18}))?")
+_SECONDS = re.compile(r"([+-]?)(\d{1,19})(?:\.(\d{1,18}))?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,12 +58,15 @@ def number(text: str) -> float:
     return value if math.isfinite(value) else math.nan
 
 
-def nanoseconds(text: str) -> int | None:
-    """Return decimal seconds as integer ns, exactly (rounded down beyond ns); None for anything else."""
+def nanoseconds(text: str, digits: int = 9) -> int | None:
+    """Return decimal seconds as integer ns, exactly (cut beyond ns); None for anything else.
+
+    ``digits`` are those of a nanosecond behind the point of the unit: 6 for milliseconds, 0 for ns themselves.
+    """
     found = _SECONDS.fullmatch(text.strip())
     if found is None:
         return None
-    value = int(found[2]) * 1_000_000_000 + int((found[3] or "").ljust(9, "0")[:9])
+    value: int = int(found[2]) * 10**digits + int("0" + (found[3] or "").ljust(digits, "0")[:digits])
     if value > 2**62:
         return None
     return -value if found[1] == "-" else value
