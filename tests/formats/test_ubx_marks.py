@@ -47,7 +47,7 @@ def test_one_exposure_for_each_step_of_the_count(tmp_path: Path) -> None:
     first, second = (made.WEEK, 1000, 0), (made.WEEK, 3000, 0)
     falling = made.tm2(65_535, first, (made.WEEK, 1300, 0), flags=FALLING | VALID | GNSS)
     quiet = made.tm2(65_535, first, (made.WEEK, 1300, 0), flags=VALID | GNSS)
-    log = read(tmp_path, made.tm2(65_535, first), falling, quiet, made.tm2(0, second))
+    log = read(tmp_path, *[made.tm2(65_535, first)] * 2, falling, quiet, made.tm2(0, second))
     assert log.exposure_table.sequence.tolist() == [65_535, 0]
     assert log.exposure_table.when.gps_ns.tolist() == [at(1000), at(3000)]
     assert log.notes == ("there are no positions in it",)

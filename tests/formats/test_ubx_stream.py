@@ -116,6 +116,20 @@ def test_reading_does_not_depend_on_blocks() -> None:
         assert again.result() == tally.result()
 
 
+def test_reading_does_not_depend_on_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(6)
+    data = b"".join(damaged(mixed_stream(rng, 20), rng).data for _ in range(5))
+    expected, tally = found(data)
+    monkeypatch.setattr(receiver_stream, "MOST_AT_ONCE", 3)
+    places, again = found(data)
+    assert places == expected
+    assert again.result() == tally.result()
+
+
+def test_a_sentence_ends_where_the_next_begins() -> None:
+    assert found(made.nmea("GPTXT,a$GPTXT,b"))[0] == []
+
+
 def test_spans_say_where_and_why() -> None:
     good = made.pvt(0)
     data = good + b"\xb5\x62\x01\x07\x04" + good + bytes(9) + good + b"$GPGGA,1" + good + b"\xd3\x00\x05" + good + b"?!"

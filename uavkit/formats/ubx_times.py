@@ -93,9 +93,8 @@ def _times_by_utc(
 ) -> tuple[Indices, NDArray[np.bool_], NDArray[np.bool_]]:
     """Return GPS times of the UTC dates of TIMEUTC and PVT by the dated table, NO_TIME without, (m,).
 
-    And where the receiver knows its leap seconds (a row inside a leap second tells nothing of it), and where it says
-    that it does not know the time. A date that is not resolved to the second counts only with a fix: before one it is
-    that of the receiver's own clock.
+    And where the receiver knows its leap seconds, and where it says that it does not know the time. A date that is not
+    resolved to the second counts only with a fix: before one it is that of the receiver's own clock.
     """
     m = len(epochs.iTOW_ms)
     result, resolved = np.full(m, NO_TIME, dtype=np.int64), np.zeros(m, dtype=np.bool_)
@@ -111,7 +110,7 @@ def _times_by_utc(
         good = there & (valid & 3 == 3) & ((valid & 4 > 0) | fixed) & (gps_ns != NO_TIME)
         good &= (hour < 24) & (minute < 60) & (second < 61)
         result, denied = np.where(good, gps_ns, result), denied | (there & ~good)
-        resolved = np.where(good, (valid & 4 > 0) & (second < 60), resolved)
+        resolved = np.where(good, valid & 4 > 0, resolved)
     return result, resolved, denied & (result == NO_TIME)
 
 
