@@ -80,10 +80,11 @@ class Definition:
 
     @property
     def pairs(self) -> tuple[tuple[str, str], ...]:
-        """Columns with their characters; a column named twice counts once."""
+        """Columns with their characters; a column named twice counts once, one without a name not at all."""
         first: dict[str, str] = {}
         for column, character in zip(self.columns, self.characters, strict=False):
-            first.setdefault(column, character)
+            if column:
+                first.setdefault(column, character)
         return tuple(first.items())
 
     def dtype(self) -> "np.dtype[np.void]":
@@ -93,7 +94,7 @@ class Definition:
         at, names, formats, offsets = 3, list[str](), list[str](), list[int]()
         taken = set[str]()
         for column, character in zip(self.columns, self.characters, strict=False):
-            if column not in taken:
+            if column and column not in taken:
                 taken.add(column)
                 names.append(column)
                 formats.append(CHARACTERS[character][0])

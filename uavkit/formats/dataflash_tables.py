@@ -57,6 +57,11 @@ _RECEIVERS = {"GPS": (0, "GPA"), "GPS2": (1, "GPA2"), "GPSB": (2, "GPAB")}
 
 def flight_log(messages: Messages, source: str, kind: LogKind) -> FlightLog:
     """Return the tables of a log; those of kinds that it does not hold are empty, and the notes say so."""
+    with np.errstate(all="ignore"):  # nothing tells a damaged number from an intact one: infinity among others
+        return _flight_log(messages, source, kind)
+
+
+def _flight_log(messages: Messages, source: str, kind: LogKind) -> FlightLog:
     notes = list(messages.notes)
     gps = _receivers(messages)
     fixes, gps_boot_ns = _fixes(gps, notes)

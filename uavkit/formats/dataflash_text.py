@@ -4,7 +4,8 @@ A line is a message: name, then the columns that a line ``FMT, type, length, nam
 parted by commas, with or without blanks; values are in whole units. A line is understood if its name is defined, it has
 as many columns as the definition (a text in the last column may hold commas), no control bytes, none above 127 where no
 column is a text, and numbers where numbers belong (looked at in the kinds that are decoded). Bytes of other lines are
-lost bytes; blank lines are not. A last line without its end is taken if it is understood.
+lost bytes; blank lines are not. A message that stands whole at the end of a line, behind what is left of another whose
+end was lost, is found. A last line without its end is taken if it is understood.
 
 Sources: ArduPilot, libraries/AP_Logger (writing as text), and the binary format in ``uavkit.formats.dataflash``.
 """
@@ -134,18 +135,34 @@ class _Lines:
         why[table[:, marks.WHAT] == marks.BROKEN] = "a line that is no message"
         if self._endless:
             why[0], self._endless = "a line without an end", False
-        self._take_kinds(block, table, why, offset)
+        defining = table[:, marks.NAME] == _code_of(_FMT)
+        self._take_kinds(block, table, defining, why, offset)
+        self._split_texts(block, table, why)
+        self._take_kinds(block, table, ~defining, why, offset)
         bad = np.flatnonzero(why != "")
         tails = np.array([self._tail(block, table[row]) for row in bad.tolist()], dtype=np.int64).reshape(-1, 5)
         tail_why = np.where(tails[:, marks.WHAT] == marks.BROKEN, "no message inside", "").astype("U64")
-        self._take_kinds(block, tails, tail_why, offset)
+        self._take_kinds(block, tails, np.full(len(tails), True), tail_why, offset)
         for row, tail, lost in zip(bad.tolist(), tails, tail_why.tolist(), strict=True):
             begin, end = int(table[row, marks.BEGIN]), int(table[row, marks.END] if lost else tail[marks.BEGIN])
             self._tally.add(offset + begin, end - begin, str(why[row]))
 
-    def _take_kinds(self, block: NDArray[np.uint8], table: Indices, why: NDArray[np.str_], offset: int) -> None:
-        """Read the lines that have no reason in ``why`` yet, definitions first."""
-        usable = (why == "") & (table[:, marks.WHAT] != marks.BLANK)
+    def _split_texts(self, block: NDArray[np.uint8], table: Indices, why: NDArray[np.str_]) -> None:
+        """Refuse lines that end with a text in which another message stands: the end of the line was lost."""
+        texts = [
+            _code_of(definition.name)
+            for definition in self._now.values()
+            if _text_columns(definition)[-1] and definition.name != _FMT
+        ]
+        for row in np.flatnonzero((why == "") & np.isin(table[:, marks.NAME], texts)).tolist():
+            if self._tail(block, table[row])[marks.WHAT] != marks.BROKEN:
+                why[row] = "a line that runs into the next one"
+
+    def _take_kinds(
+        self, block: NDArray[np.uint8], table: Indices, which: NDArray[np.bool_], why: NDArray[np.str_], offset: int
+    ) -> None:
+        """Read those of some lines that have no reason in ``why`` yet, definitions first."""
+        usable = which & (why == "") & (table[:, marks.WHAT] != marks.BLANK)
         codes = np.unique(table[usable, marks.NAME]).tolist()
         for code in sorted(codes, key=lambda code: _name_of(code) != _FMT):
             rows = np.flatnonzero(usable & (table[:, marks.NAME] == code))
@@ -255,6 +272,10 @@ def _text_columns(definition: Definition) -> NDArray[np.bool_]:
 
 def _name_of(code: int) -> str:
     return code.to_bytes(8, "little").rstrip(b"\0").decode("ascii")
+
+
+def _code_of(name: str) -> int:
+    return int.from_bytes(name.encode("ascii")[:8], "little")
 
 
 def _texts(block: NDArray[np.uint8], bounds: Indices) -> Column:
