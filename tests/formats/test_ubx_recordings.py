@@ -1,7 +1,9 @@
 """Recordings of real receivers, read here and by pyubx2."""
 
+import re
 import time
 from collections import Counter
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,7 @@ import numpy as np
 import pytest
 
 from uavkit.core.flight_log import FixType, LogKind
-from uavkit.core.gpstime import WEEK_NS
+from uavkit.core.gpstime import WEEK_NS, gps_time_ns_from_utc
 from uavkit.core.progress import silent
 from uavkit.formats import nmea, ubx
 from uavkit.formats.ubx_messages import name_of_frame
@@ -63,6 +65,8 @@ def test_car_trip_equals_the_peer() -> None:
                 table.velocity_m_s[row] * 100, [message.velE, message.velN, -message.velD], atol=0.51
             )
         else:
+            if message.identity == "NAV-PVT":
+                assert abs(int(table.when.gps_ns[row]) - utc_gps_ns_of(message)) <= 1
             assert table.latitude_deg[row] == pytest.approx(message.lat, abs=1e-9)
             assert table.longitude_deg[row] == pytest.approx(message.lon, abs=1e-9)
             assert table.height_ellipsoid_m[row] * 1000 == pytest.approx(message.height)
@@ -75,6 +79,12 @@ def test_car_trip_equals_the_peer() -> None:
 def tow_ns_of(message: Any) -> int:
     """Return the time of week, which pyubx2 shows as a UTC time of day on some day: from the raw bytes."""
     return int.from_bytes(message.payload[:4], "little") * 1_000_000
+
+
+def utc_gps_ns_of(message: Any) -> int:
+    """Return the GPS time of PVT's UTC as pyubx2 decodes it."""
+    fields = (message.year, message.month, message.day, message.hour, message.min, message.second)
+    return gps_time_ns_from_utc(datetime(*fields, tzinfo=UTC)) + int(message.nano)
 
 
 @needs_data
@@ -115,6 +125,30 @@ def test_damaged_fixtures_lose_what_is_damaged() -> None:
     ):
         damage = ubx.read_log(folder / name, silent).damage
         assert [(span.offset, span.length) for span in damage.spans] == spans, name
+
+
+@needs_data
+def test_sentences_equal_the_peers(tmp_path: Path) -> None:
+    """The NMEA sentences of all recordings, each read by itself; pynmeagps rounds degrees to 1e-10."""
+    pynmeagps = pytest.importorskip("pynmeagps", reason="pynmeagps is not installed")
+    path, places, found = tmp_path / "sentence.nmea", 0, 0
+    for source in FIXTURES:
+        for match in re.finditer(rb"\$..(GGA|RMC|GLL|GNS),[ -#%-~]*\*[0-9A-F]{2}\r\n", source.read_bytes()):
+            peer = pynmeagps.NMEAReader.parse(match.group())
+            path.write_bytes(match.group())
+            table, found = nmea.read_log(path, silent).fix_table, found + 1
+            if peer.lat == "" or not peer.time:
+                assert not np.isfinite(table.latitude_deg).any()
+                continue
+            places += 1
+            assert table.latitude_deg == pytest.approx(peer.lat, abs=1e-9)
+            assert table.longitude_deg == pytest.approx(peer.lon, abs=1e-9)
+            if hasattr(peer, "alt"):
+                assert table.height_geoid_m == pytest.approx(peer.alt)
+                assert table.height_ellipsoid_m == pytest.approx(peer.alt + peer.sep)
+                assert table.satellites.tolist() == [peer.numSV]
+    assert found > 200
+    assert places > 5
 
 
 @needs_data
