@@ -10,7 +10,8 @@ camera_capture, camera_feedback). The format itself is read by ``uavkit.formats.
 * Several topics tell of the receivers: ``sensor_gps`` of each one, but PX4 by default writes it once in a second, and
   ``vehicle_gps_position`` (the receiver in use, or the mean of several) at the full rate. The denser one is taken.
 * A picture stands in ``camera_capture``; its time is that of the ``camera_trigger`` that it answers. Where that one has
-  feedback, the camera's flash contact was seen. Triggers without a capture are listed as such.
+  feedback, the camera's flash contact was seen. Triggers without a capture are listed as such. The attitude is the
+  vehicle's, but a gimbal's where there is one: then it is left out, and noted.
 """
 
 from collections.abc import Mapping
@@ -49,6 +50,9 @@ NEAR_S = 0.1
 """The estimate of the velocity is taken from as near as this."""
 ANSWER_S = 2.0
 """A picture answers a trigger no later than this."""
+GIMBAL_DEG = 15.0
+"""Attitudes of pictures that differ by more than this from the vehicle's at the time are a gimbal's."""
+GIMBAL_NEAR_S = 0.2
 EARLIEST_UNIX_S = 1_234_567_890
 """PX4 sets its calendar by a receiver only after this instant (2009); receivers without time are before it."""
 LATEST_UNIX_S = 7_258_118_400
@@ -62,7 +66,7 @@ _RECEIVER = (
     "vel_n_m_s", "vel_e_m_s", "vel_d_m_s", "vel_ned_valid", "satellites_used",
 )  # fmt: skip
 WANTED: Mapping[str, tuple[str, ...]] = {
-    "camera_capture": ("timestamp", "timestamp_utc", "seq", "lat", "lon", "alt", "q", "result"),
+    "camera_capture": ("timestamp", "timestamp_utc", "seq", "lat", "lon", "alt", "q[4]", "result"),
     "camera_trigger": ("timestamp", "timestamp_utc", "seq", "feedback"),
     "sensor_gps": _RECEIVER,
     "vehicle_gps_position": _RECEIVER,
@@ -71,7 +75,7 @@ WANTED: Mapping[str, tuple[str, ...]] = {
         "lat_lon_valid", "alt_valid", "alt_ellipsoid_valid",
     ),
     "vehicle_local_position": ("timestamp", "timestamp_sample", "vx", "vy", "vz", "v_xy_valid", "v_z_valid"),
-    "vehicle_attitude": ("timestamp", "timestamp_sample", "q"),
+    "vehicle_attitude": ("timestamp", "timestamp_sample", "q[4]"),
 }  # fmt: skip
 """Topics and fields that are read; a log has those of its own time."""
 LEAST_DEFINITIONS = 3
@@ -87,6 +91,11 @@ def read_log(path: Path, progress: Progress) -> FlightLog:
     content = read_ulog(path, WANTED, progress)
     if not content.message_counts:
         raise InputError(f"{path}: no intact message of a PX4 log (ULog) is in it: download it again")
+    with np.errstate(over="ignore", invalid="ignore"):  # damaged values are any bits whatsoever
+        return _flight_log(path, content)
+
+
+def _flight_log(path: Path, content: UlogContent) -> FlightLog:
     notes = list(content.notes)
     receivers, words = _receivers(content)
     fixes = _fixes(receivers)
@@ -123,22 +132,13 @@ def _vehicle(content: UlogContent) -> str:
 def _boot_ns(rows: Rows) -> Indices:
     """Return the boot times of rows: of their samples where they are stated; NO_TIME where there is none."""
     stamp = rows["timestamp"]
-    if "timestamp_sample" in _names(rows):
-        sample = rows["timestamp_sample"]
-        stamp = np.where((sample > 0) & (sample <= stamp), sample, stamp)
-    return _boot_ns_of(stamp)
+    sample = _whole(rows, "timestamp_sample", 0).astype(np.uint64)
+    return _boot_ns_of(np.where((sample > 0) & (sample <= stamp), sample, stamp))
 
 
 def _boot_ns_of(microseconds: NDArray[np.uint64]) -> Indices:
     good = (microseconds > 0) & (microseconds < LONGEST_BOOT_S * 1_000_000)
     return np.where(good, np.where(good, microseconds, 0).astype(np.int64) * 1000, NO_TIME)
-
-
-def _gps_ns(utc_us: NDArray[np.uint64]) -> Indices:
-    """Return GPS times of UTC in microseconds of Unix time; NO_TIME where the calendar was not set yet."""
-    good = (utc_us > EARLIEST_UNIX_S * 1_000_000) & (utc_us < LATEST_UNIX_S * 1_000_000)
-    unix_ns = np.where(good, np.where(good, utc_us, 0).astype(np.int64) * 1000, NO_TIME)
-    return gps_times_ns_from_unix_ns(unix_ns)
 
 
 def _names(rows: Rows) -> tuple[str, ...]:
@@ -152,6 +152,13 @@ def _column(rows: Rows, *names: str) -> Array:
         return np.full(len(rows), np.nan)
     values = rows[name].astype(np.float64)
     return np.where(np.isfinite(values), values, np.nan)
+
+
+def _whole(rows: Rows, name: str, unknown: int) -> Indices:
+    """Return a column of whole numbers, (n,), all ``unknown`` where the rows have none."""
+    if name not in _names(rows) or not np.issubdtype(rows[name].dtype, np.integer):
+        return np.full(len(rows), unknown, dtype=np.int64)
+    return rows[name].astype(np.int64)
 
 
 def _scaled(rows: Rows, name: str, older: str, scale: float) -> Array:
@@ -240,17 +247,15 @@ def _fixes_of(topic: Topic) -> FixTable:
         sigma_horizontal_m=_sigma(rows, "eph"),
         sigma_vertical_m=_sigma(rows, "epv"),
         fix_type=_fix_types(rows),
-        satellites=rows["satellites_used"] if "satellites_used" in _names(rows) else np.full(len(rows), 255, np.uint8),
+        satellites=np.clip(_whole(rows, "satellites_used", 255), 0, 255).astype(np.uint8),
         receiver=np.full(len(rows), topic.instance, dtype=np.uint8),
     )
 
 
 def _fix_types(rows: Rows) -> NDArray[np.uint8]:
     """Return MAVLink's numbers of PX4's, which are the same but for 8: extrapolated, so nothing was measured."""
-    if "fix_type" not in _names(rows):
-        return np.full(len(rows), FixType.UNKNOWN, dtype=np.uint8)
-    told = rows["fix_type"].astype(np.uint8)
-    known = np.where(told <= FixType.RTK_FIXED, told, FixType.UNKNOWN)
+    told = _whole(rows, "fix_type", int(FixType.UNKNOWN))
+    known = np.where((told >= 0) & (told <= FixType.RTK_FIXED), told, FixType.UNKNOWN)
     return np.where(told == 8, FixType.NO_FIX, known).astype(np.uint8)
 
 
@@ -276,14 +281,10 @@ def _time_pairs(rows: Rows) -> tuple[Indices, Indices]:
 
     The UTC of a row is that of ``timestamp`` plus ``timestamp_time_relative``.
     """
-    if "time_utc_usec" not in _names(rows):
-        return np.full(len(rows), NO_TIME, dtype=np.int64), np.full(len(rows), NO_TIME, dtype=np.int64)
-    boot_ns = _boot_ns(rows)
-    if "timestamp_time_relative" in _names(rows):
-        relative = rows["timestamp_time_relative"].astype(np.int64) * 1000
-        own_ns = _boot_ns_of(rows["timestamp"])
-        boot_ns = np.where((relative != 0) & (own_ns != NO_TIME), own_ns + relative, boot_ns)
-    return boot_ns, _gps_ns(rows["time_utc_usec"])
+    boot_ns, own_ns = _boot_ns(rows), _boot_ns_of(rows["timestamp"])
+    relative_ns = _whole(rows, "timestamp_time_relative", 0) * 1000
+    moved = (relative_ns != 0) & (own_ns != NO_TIME)
+    return np.where(moved, own_ns + np.where(moved, relative_ns, 0), boot_ns), _calendar(rows, "time_utc_usec")
 
 
 def _without_wrong_times(table: FixTable, clock: ClockFit | None) -> FixTable:
@@ -364,12 +365,9 @@ def _angles(quaternions: NDArray[np.float32]) -> tuple[Array, Array, Array]:
 
     R = Rz(yaw) Ry(pitch) Rx(roll); NaN where a quaternion is not of unit length.
     """
-    q = quaternions.astype(np.float64).reshape(len(quaternions), -1)
-    if q.shape[1] != 4:
-        return np.full(len(q), np.nan), np.full(len(q), np.nan), np.full(len(q), np.nan)
-    with np.errstate(over="ignore", invalid="ignore"):
-        length = np.sqrt(np.sum(q**2, axis=1))
-        q = np.where((np.abs(length - 1.0) < 0.01)[:, None], q / np.where(length > 0.0, length, 1.0)[:, None], np.nan)
+    q = quaternions.astype(np.float64)
+    length = np.sqrt(np.sum(q**2, axis=1))
+    q = np.where((np.abs(length - 1.0) < 0.01)[:, None], q / np.where(length > 0.0, length, 1.0)[:, None], np.nan)
     w, x, y, z = q.T
     roll_rad = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch_rad = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
@@ -407,7 +405,7 @@ def _exposures(content: UlogContent) -> tuple[ExposureTable, Indices, list[str]]
     """Return the exposures in the order of time, the vehicle's calendar for each as GPS time, and notes."""
     captured, asked = _events(content, "camera_capture"), _events(content, "camera_trigger")
     notes = captured.notes + asked.notes
-    failed = captured.rows["result"] == 0 if "result" in _names(captured.rows) else np.zeros(len(captured.rows), bool)
+    failed = _whole(captured.rows, "result", 1) == 0
     if failed.any():
         notes.append(f"camera_capture: {int(failed.sum())} failed: no exposures")
     taken = captured.rows[~failed]
@@ -416,18 +414,35 @@ def _exposures(content: UlogContent) -> tuple[ExposureTable, Indices, list[str]]
     if not len(taken) and not left.any():
         return no_exposures(), np.zeros(0, dtype=np.int64), notes
     if len(taken) and left.any():
-        notes.append(f"camera_trigger: {int(left.sum())} without a picture in camera_capture: listed as triggers")
+        notes.append(f"camera_trigger: {int(left.sum())} without a picture in camera_capture: listed too")
     kinds = np.concatenate([_kinds_captured(taken, taken_ns, asked), _kinds_asked(asked.rows[left])])
     boot_ns = np.concatenate([taken_ns, asked.boot_ns[left]])
     order = np.argsort(boot_ns, kind="stable")
+    captures = _capture_columns(taken)
+    if _is_of_gimbal(content, taken, taken_ns):
+        notes.append("camera_capture: attitudes are not the vehicle's but a gimbal's: left out")
+        captures |= {name: np.full(len(taken), np.nan) for name in ("roll_rad", "pitch_rad", "yaw_rad")}
     columns = {
-        name: np.concatenate([values, np.full(int(left.sum()), np.nan)])[order]
-        for name, values in _capture_columns(taken).items()
+        name: np.concatenate([values, np.full(int(left.sum()), np.nan)])[order] for name, values in captures.items()
     }
-    counted = np.concatenate([_sequence(taken), _sequence(asked.rows[left])])[order]
-    calendar = np.concatenate([_calendar(taken), _calendar(asked.rows[left])])[order]
+    counted = np.concatenate([_whole(taken, "seq", -1), _whole(asked.rows[left], "seq", -1)])[order]
+    calendar = np.concatenate([_calendar(taken, "timestamp_utc"), _calendar(asked.rows[left], "timestamp_utc")])[order]
     when = Stamps.of(len(order), boot_ns=boot_ns[order])
     return exposure_table(when, kinds[order], sequence=counted, **columns), calendar, notes
+
+
+def _is_of_gimbal(content: UlogContent, taken: Rows, taken_ns: Indices) -> bool:
+    """Tell whether the attitudes of the pictures are other than the vehicle's: PX4 writes a gimbal's where it has one.
+
+    The angle between both is 2 acos |q1 . q2|; the median over the pictures counts.
+    """
+    topics = content.of("vehicle_attitude")
+    if not topics or not len(taken) or "q" not in _names(taken) or "q" not in _names(topics[0].rows):
+        return False
+    row, near = _nearest(_boot_ns(topics[0].rows), taken_ns, GIMBAL_NEAR_S)
+    dot = np.abs(np.sum(topics[0].rows["q"][row].astype(np.float64) * taken["q"].astype(np.float64), axis=1))
+    angle_deg = np.degrees(2.0 * np.arccos(np.clip(dot[near], 0.0, 1.0)))
+    return bool(len(angle_deg) and np.median(angle_deg) > GIMBAL_DEG)
 
 
 def _unanswered(asked: _Events, taken_ns: Indices) -> NDArray[np.bool_]:
@@ -450,13 +465,13 @@ def _unanswered(asked: _Events, taken_ns: Indices) -> NDArray[np.bool_]:
 
 
 def _feedback(rows: Rows) -> NDArray[np.bool_]:
-    return rows["feedback"] != 0 if "feedback" in _names(rows) else np.zeros(len(rows), dtype=np.bool_)
+    return np.asarray(_whole(rows, "feedback", 0) != 0, dtype=np.bool_)
 
 
 def _kinds_captured(rows: Rows, boot_ns: Indices, asked: _Events) -> NDArray[np.uint8]:
     """Return the kinds of pictures: FEEDBACK where their trigger is the flash contact's, TRIGGER without an answer."""
     contact = np.isin(boot_ns, asked.boot_ns[_feedback(asked.rows)])
-    blind = rows["result"] < 0 if "result" in _names(rows) else np.zeros(len(rows), dtype=np.bool_)
+    blind = _whole(rows, "result", 1) < 0
     kinds = np.where(blind, ExposureKind.TRIGGER, ExposureKind.CAPTURED)
     return np.where(contact, ExposureKind.FEEDBACK, kinds).astype(np.uint8)
 
@@ -480,11 +495,8 @@ def _capture_columns(rows: Rows) -> dict[str, Array]:
     }
 
 
-def _sequence(rows: Rows) -> Indices:
-    return rows["seq"].astype(np.int64) if "seq" in _names(rows) else np.full(len(rows), -1, dtype=np.int64)
-
-
-def _calendar(rows: Rows) -> Indices:
-    if "timestamp_utc" not in _names(rows):
-        return np.full(len(rows), NO_TIME, dtype=np.int64)
-    return _gps_ns(rows["timestamp_utc"])
+def _calendar(rows: Rows, name: str) -> Indices:
+    """Return the GPS times of a column of UTC in microseconds of Unix time, (n,); NO_TIME where it was not set yet."""
+    utc_us = _whole(rows, name, 0)
+    good = (utc_us > EARLIEST_UNIX_S * 1_000_000) & (utc_us < LATEST_UNIX_S * 1_000_000)
+    return gps_times_ns_from_unix_ns(np.where(good, np.where(good, utc_us, 0) * 1000, NO_TIME))

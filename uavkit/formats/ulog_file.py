@@ -35,7 +35,8 @@ HEADER_BYTES = 16
 BLOCK_BYTES = 1024 * 1024
 MOST_TEXTS = 10_000
 _MOST_LISTED = 1 << 17
-_MOST_NESTED = 8
+MOST_FORMATS, MOST_ALIKE = 1024, 8
+"""Formats of a log, and subscriptions under one number, that are kept: what is beyond is no flight log."""
 _TYPES = {
     "int8_t": "i1", "uint8_t": "u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4", "uint32_t": "<u4",
     "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8", "bool": "u1", "char": "S1",
@@ -81,7 +82,10 @@ class UlogContent:
 
 
 def read_ulog(path: Path, wanted: Mapping[str, tuple[str, ...]], progress: Progress) -> UlogContent:
-    """Read a file; ``wanted`` names topics and their fields. Raises InputError where it cannot be read at all."""
+    """Read a file; ``wanted`` names topics and their fields, arrays as ``q[4]``.
+
+    Raises InputError where the file cannot be read at all.
+    """
     size = max(path.stat().st_size, 1) if path.is_file() else 1
     with opened(path) as stream:
         blocks, scanner = Blocks(stream, BLOCK_BYTES), _Scanner(wanted)
@@ -115,6 +119,8 @@ class _Subscription:
     name: str
     instance: int
     number: int
+    section: int
+    """How many headers of files stand before it."""
     least: int = 0
     most: int = -1
     row: "np.dtype[Any] | None" = None
@@ -133,6 +139,9 @@ class _Scanner:
         self._frames = np.zeros((_MOST_LISTED, 3), dtype=np.int64)
         self._spans = np.zeros((4096, 3), dtype=np.int64)
         self._formats: dict[str, _Format] = {}
+        self._bytes: dict[str, int] = {}
+        self._open_formats: list[_Format] = []
+        self._open_subscriptions: list[_Subscription] = []
         self._subscriptions: dict[int, list[_Subscription]] = {}
         self._topics: list[_Subscription] = []
         self._named_counts: dict[str, int] = {}
@@ -223,23 +232,41 @@ class _Scanner:
 
     def _take_format(self, body: bytes) -> None:
         one = _format_of(body)
-        if one is None or one.name in self._formats:
+        if one is None or one.name in self._formats or len(self._formats) == MOST_FORMATS:
             return
         self._formats[one.name] = one
-        for name in self._formats:
-            sizes = self._sizes(name)
-            if sizes is not None:
-                self._tables.known_sizes[list(sizes)] = True
-        for subscriptions in self._subscriptions.values():
-            for subscription in subscriptions:
-                if subscription.most < 0:
-                    self._resolve(subscription)
+        self._open_formats.append(one)
+        while any([self._settle(open_one) for open_one in self._open_formats]):
+            self._open_formats = [one for one in self._open_formats if one.name not in self._bytes]
+        for subscription in self._open_subscriptions:
+            self._resolve(subscription)
+        self._open_subscriptions = [one for one in self._open_subscriptions if one.most < 0]
+
+    def _settle(self, one: _Format) -> bool:
+        """Work out the length of a format, and tell whether that can be done yet: nested ones come first."""
+        lengths = [self._type_bytes(kind) for kind, _, _ in one.fields]
+        if None in lengths:
+            return False
+        self._bytes[one.name] = sum(
+            (each or 0) * count for each, (_, count, _) in zip(lengths, one.fields, strict=True)
+        )
+        sizes = self._sizes(one.name)
+        if sizes is not None:
+            self._tables.known_sizes[list(sizes)] = True
+        return True
 
     def _take_subscription(self, body: bytes) -> None:
         number = body[1] + 256 * body[2]
-        one = _Subscription(name=body[3:].decode("ascii"), instance=body[0], number=number)
+        one = _Subscription(
+            name=body[3:].decode("ascii"),
+            instance=body[0],
+            number=number,
+            section=self.type_count(chr(kernels.HEADER_TYPE)),
+        )
         others = self._subscriptions.setdefault(number, [])
-        if any((other.name, other.instance) == (one.name, one.instance) for other in others):
+        if len(others) == MOST_ALIKE or any(
+            (other.name, other.instance) == (one.name, one.instance) for other in others
+        ):
             return
         if others:
             self._note(f"two subscriptions under the number {number}: {others[-1].name} and {one.name}")
@@ -248,6 +275,8 @@ class _Scanner:
         self._topics.append(one)
         self._tables.subscribed[number] = True
         self._resolve(one)
+        if one.most < 0:
+            self._open_subscriptions.append(one)
 
     def _resolve(self, one: _Subscription) -> None:
         sizes = self._sizes(one.name)
@@ -262,35 +291,28 @@ class _Scanner:
 
     def _sizes(self, name: str) -> tuple[int, int] | None:
         """Return the least and the greatest size of data messages of a format; None where it cannot be known."""
-        most = self._format_bytes(name, 0)
-        if most is None or not 8 <= most <= 65533:
+        most = self._bytes.get(name, 0)
+        if not 8 <= most <= 65533:
             return None
         least = most
         for kind, count, label in reversed(self._formats[name].fields):
             if not label.startswith("_padding"):
                 break
-            least -= (self._type_bytes(kind, 0) or 0) * count
+            least -= (self._type_bytes(kind) or 0) * count
         return max(least, 8) + 2, most + 2
 
-    def _format_bytes(self, name: str, depth: int) -> int | None:
-        if name not in self._formats or depth > _MOST_NESTED:
-            return None
-        total = 0
-        for kind, count, _ in self._formats[name].fields:
-            each = self._type_bytes(kind, depth + 1)
-            if each is None or (total := total + each * count) > 65535:
-                return None
-        return total
-
-    def _type_bytes(self, kind: str, depth: int) -> int | None:
-        return np.dtype(_TYPES[kind]).itemsize if kind in _TYPES else self._format_bytes(kind, depth)
+    def _type_bytes(self, kind: str) -> int | None:
+        """Return the length of a basic type or a format; None where it is not known (yet)."""
+        return np.dtype(_TYPES[kind]).itemsize if kind in _TYPES else self._bytes.get(kind)
 
     def _row_type(self, name: str, wanted: tuple[str, ...]) -> "np.dtype[Any] | None":
         """Return the type of the first bytes of a message, up to the last field that is wanted."""
         at, names, kinds, offsets = 0, list[str](), list[Any](), list[int]()
         for kind, count, label in self._formats[name].fields:
-            size = (self._type_bytes(kind, 0) or 0) * count
-            if label in wanted and kind in _TYPES and label not in names:
+            size = (self._type_bytes(kind) or 0) * count
+            asked = label if count == 1 else f"{label}[{count}]"
+            usable = kind in _TYPES and kind != "char" and not label.startswith("_padding")
+            if asked in wanted and usable and label not in names:
                 names.append(label)
                 kinds.append(_TYPES[kind] if count == 1 else (_TYPES[kind], (count,)))
                 offsets.append(at)
@@ -304,10 +326,11 @@ class _Scanner:
 
     def _take_value(self, letter: str, kind: str, name: str, value: bytes) -> None:
         number = np.frombuffer(value, dtype=_TYPES[kind])[0].item() if kind in _TYPES and kind != "char" else None
-        if letter == "I":
+        if letter == "I" and len(self._information) < MOST_TEXTS:
             self._information[name] = value.decode("utf-8", "replace") if number is None else number
-        elif number is not None:
-            (self._parameters if letter == "P" else self._defaults)[name] = float(number)
+        parameters = self._parameters if letter == "P" else self._defaults
+        if letter != "I" and number is not None and (name in parameters or len(parameters) < MOST_TEXTS):
+            parameters[name] = float(number)
 
     def _note(self, text: str) -> None:
         if len(self._notes) < 50 and text not in self._notes:
@@ -350,17 +373,25 @@ class _Scanner:
 
     def _joined(self) -> Iterator[Topic]:
         """Yield the topics; the parts of each are let go as soon as they are joined."""
-        chunks: dict[tuple[str, int], list[Rows]] = {}
-        for one in self._topics:
-            chunks.setdefault((one.name, one.instance), []).extend(one.chunks)
-            one.chunks = []
-        for name, instance in sorted(chunks):
-            parts = chunks.pop((name, instance))
-            same = [part for part in parts if part.dtype == parts[0].dtype]
-            if len(same) < len(parts):
-                self._note(f"{name}: a second format within the file is left out")
-            if same:
-                yield Topic(name=name, instance=instance, rows=np.concatenate(same))
+        filled = [one for one in self._topics if one.chunks]
+        for name, instance in sorted({(one.name, one.instance) for one in filled}):
+            parts = list[Rows]()
+            for section in sorted({one.section for one in filled}):
+                key = (name, instance, section)
+                same = [one for one in filled if (one.name, one.instance, one.section) == key]
+                if len(same) > 1:
+                    self._note(f"{name} is logged under two numbers: the one with more messages is read")
+                if same:
+                    parts += max(same, key=lambda one: sum(map(len, one.chunks))).chunks
+                for one in same:
+                    one.chunks = []
+            if parts:
+                yield Topic(name=name, instance=instance, rows=_concatenated(parts))
+
+
+def _concatenated(parts: list[Rows]) -> Rows:
+    """Return parts as one table of the fields of the first of them; those of another format are left out."""
+    return np.concatenate([part for part in parts if part.dtype == parts[0].dtype])
 
 
 def _empty_tables() -> kernels.Tables:
