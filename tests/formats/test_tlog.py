@@ -11,6 +11,7 @@ from uavkit.core.errors import InputError
 from uavkit.core.flight_log import ExposureKind, FixType, FlightLog, LogKind
 from uavkit.core.gpstime import NO_TIME, UNIX_EPOCH_NS
 from uavkit.formats import tlog
+from uavkit.formats.flight_logs import open_log
 from uavkit.formats.mavlink_messages import FIELDS, dialect, payload_type
 
 UNIX_US = 1_795_000_000_000_000
@@ -203,6 +204,66 @@ def test_fields_of_image_captured(tmp_path: Path) -> None:
         assert table.when.gps_ns.tolist() == [gps_ns(at(3.0)[0])]
         assert table.when.boot_ns.tolist() == [at(3.0)[1] * 1_000_000]
         assert table.sequence.tolist() == [0]
+
+
+def shot_by(component: int, turned_deg: tuple[float, float, float], seconds: float, number: int) -> bytes:
+    """Return CAMERA_IMAGE_CAPTURED with a quaternion of yaw, then pitch, then roll."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(np.radians(turned_deg) / 2), np.sin(np.radians(turned_deg) / 2)
+    q = (cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy,
+         cr * cp * sy - sr * sp * cy)  # fmt: skip
+    unix, boot, _ = at(seconds)
+    values = (unix, boot, 358_000_780, 1_396_500_953, 20_057, 15_305, *(float(x) for x in q), number, 0, 1, b"")
+    return said("CAMERA_IMAGE_CAPTURED", values, seconds, Sender(component=component))
+
+
+def test_quaternion_is_roll_pitch_yaw(tmp_path: Path) -> None:
+    turned = (10.0, -20.0, 100.0)
+    table = read(tmp_path, beats() + clock() + shot_by(1, turned, 3.0, 0)).exposure_table
+    read_deg = np.degrees([table.roll_rad[0], table.pitch_rad[0], table.yaw_rad[0]])
+    np.testing.assert_allclose(read_deg, turned, atol=1e-4)
+    unknown = (at(3)[0], at(3)[1], 1, 1, 1, 1, 0.0, 0.0, 0.0, 0.0, 0, 1, 1)
+    none = read(tmp_path, beats() + clock() + said("CAMERA_IMAGE_CAPTURED", unknown, 3.0)).exposure_table
+    assert np.isnan(none.roll_rad[0])
+
+
+def test_first_of_several_cameras(tmp_path: Path) -> None:
+    level = (0.0, 0.0, 0.0)
+    shots = b"".join(shot_by(100 + (k & 1), level, 3.0 + k, k) for k in range(6))
+    log = read(tmp_path, beats() + clock() + shots)
+    assert log.exposure_table.sequence.tolist() == [0, 2, 4]
+    assert any("exposures of several cameras: 1 (3 reports), 2 (3 reports)" in note for note in log.notes)
+
+
+def test_time_of_a_camera_with_its_own_boot_clock_is_not_believed(tmp_path: Path) -> None:
+    shots = b"".join(feedback(7_000_000 + k * 1_000_000, k, 10.0 + k) for k in range(3))
+    log = read(tmp_path, beats() + clock(first=100.0) + b"".join(clock(1, first=f) for f in range(131, 140)) + shots)
+    table = log.exposure_table
+    assert any("not the vehicle's" in note for note in log.notes)
+    received = [gps_ns(at(10.0 + k)[2]) - LAG_US * 1000 for k in range(3)]  # the lead of the computer is taken off
+    np.testing.assert_allclose(table.when.gps_ns, received, atol=1000)
+    assert (table.sigma_s >= 0.5).all()
+    assert table.when.boot_ns.tolist() == [NO_TIME] * 3
+
+
+def test_equal_heights_above_ellipsoid_and_sea_are_told(tmp_path: Path) -> None:
+    def fixes(undulation_mm: int) -> bytes:
+        rows = (
+            (at(k)[1] * 1000, 358_000_001, 1_396_500_002, 20_000, 1, 1, 1, 1, 3, 9, 20_000 + undulation_mm)
+            for k in range(12)
+        )
+        return b"".join(said("GPS_RAW_INT", row, k) for k, row in enumerate(rows))
+
+    for undulation_mm, told in ((0, True), (37_000, False)):
+        notes = read(tmp_path, beats() + fixes(undulation_mm)).notes
+        assert any("same heights" in note for note in notes) == told
+
+
+def test_progress_is_told_and_the_log_is_opened_by_content(tmp_path: Path) -> None:
+    path, calls = tmp_path / "renamed.BIN", list[tuple[int, int]]()
+    path.write_bytes(beats() + clock(100))
+    log = open_log(path, lambda _stage, done, total: calls.append((done, total)))
+    assert log.kind is LogKind.TLOG
+    assert calls[-1] == (path.stat().st_size, path.stat().st_size)
 
 
 def test_captured_without_utc_goes_by_the_clock_and_failed_ones_are_none(tmp_path: Path) -> None:

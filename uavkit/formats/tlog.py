@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from uavkit.core.errors import InputError
-from uavkit.core.flight_log import FlightLog, LogKind
+from uavkit.core.flight_log import FixTable, FlightLog, LogKind
 from uavkit.core.progress import Progress, silent
 from uavkit.formats.mavlink_messages import (
     ATTITUDE,
@@ -54,6 +54,7 @@ _BYTEWISE = 1 << 4
 _CHAINED = 2
 """Messages that follow one another without a gap by which a file is recognised; chance does not bring that about."""
 _SHORT_HEAD = 1024
+_FEWEST_SAME = 10
 
 
 def recognises(head: bytes) -> bool:
@@ -86,8 +87,7 @@ def read_log(path: Path, progress: Progress = silent) -> FlightLog:
     exposure_table = exposures(rows, vehicle, pilot, notes)
     fix_table = fixes(rows, vehicle)
     notes += _time_notes(raw, rows, vehicle)
-    if len(fix_table) == 0:
-        notes.append("no positions of a GNSS receiver in this log")
+    notes += _height_notes(fix_table)
     longest = vehicle.longest
     return FlightLog(
         source=str(path),
@@ -204,6 +204,19 @@ def _vehicle_name(rows: Mapping[int, Rows], component: int, texts: tuple[str, ..
         version = int(versions[-1])
         words.append(f"{version >> 24}.{version >> 16 & 255}.{version >> 8 & 255}")
     return " ".join(words)
+
+
+def _height_notes(fixes: FixTable) -> list[str]:
+    if len(fixes) == 0:
+        return ["no positions of a GNSS receiver in this log"]
+    both = np.isfinite(fixes.height_ellipsoid_m) & np.isfinite(fixes.height_geoid_m)
+    same = fixes.height_ellipsoid_m[both] == fixes.height_geoid_m[both]
+    if len(same) >= _FEWEST_SAME and same.all():
+        return [
+            "the receiver states the same heights above ellipsoid and mean sea level: it knows no geoid (or is "
+            "simulated), one of the two is wrong by the geoid's height"
+        ]
+    return []
 
 
 def _time_notes(raw: RawLog, rows: Mapping[int, Rows], vehicle: VehicleTime) -> list[str]:

@@ -211,7 +211,7 @@ def _captured(rows: Mapping[int, Rows], vehicle: VehicleTime, pilot: Pilot, note
     boot = boot_ns(f["time_boot_ms"])
     by_utc = gps_times_ns_from_unix_ns(unix_ns(f["time_utc"]))
     by_clock = vehicle.gps_ns(boot, part.offset)
-    gps = _nearer_to_reception(by_utc, by_clock)
+    gps = _utc_or_clock(by_utc, by_clock)
     kind = np.where(f["capture_result"] == _SUCCESS, ExposureKind.CAPTURED, ExposureKind.TRIGGER).astype(np.uint8)
     sigma_s = np.where(kind == ExposureKind.TRIGGER, TRIGGER_SIGMA_S, np.nan)
     when, sigma = _checked_times(part, (gps, boot), sigma_s, vehicle, rows, notes)
@@ -300,7 +300,7 @@ def _host_sigma_s(vehicle: VehicleTime) -> float:
     return max([0.01, *spreads])
 
 
-def _nearer_to_reception(by_utc: Indices, by_clock: Indices) -> Indices:
+def _utc_or_clock(by_utc: Indices, by_clock: Indices) -> Indices:
     """Return the message's own UTC where the vehicle's clock does not contradict it, else the clock's time."""
     both = (by_utc != NO_TIME) & (by_clock != NO_TIME)
     agree = np.abs(np.where(both, by_utc - np.where(both, by_clock, 0), 0)) < _FAR_NS
