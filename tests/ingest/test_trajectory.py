@@ -1,6 +1,7 @@
 """Positions between fixes, against paths whose truth is known."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -78,8 +79,9 @@ def test_a_cubic_path_is_followed_exactly() -> None:
     found, (position, velocity) = trajectory.at(ns(wanted)), cubic(wanted)
     assert found.known.all()
     np.testing.assert_allclose(in_frame(found), position, rtol=0, atol=1e-5)
-    # The axes of both frames differ by the curvature of some metres.
-    np.testing.assert_allclose(found.velocity_m_s, velocity, rtol=0, atol=1e-4)
+    # Velocities are linear in between: off by an eighth of the interval squared times the change of acceleration.
+    np.testing.assert_allclose(found.velocity_m_s, velocity, rtol=0, atol=0.5**2 / 8.0 * 6.0 * 0.08 + 1e-4)
+    np.testing.assert_allclose(trajectory.at(ns(t)).velocity_m_s, cubic(t)[1], rtol=0, atol=1e-4)
 
 
 def test_differences_of_positions_follow_a_parabola() -> None:
@@ -110,6 +112,35 @@ def test_errors_stay_within_their_bound(rate_hz: float, doppler: bool) -> None:
         ratios.append(np.sqrt(np.mean(bound**2) / np.mean(size**2)))
     assert np.mean(shares) < 0.05
     assert np.median(ratios) < 8.0
+
+
+def test_a_recorded_drive() -> None:
+    """Every second fix of a receiver in a car, 1 Hz: the others are where the cubic leads."""
+    path = Path(__file__).resolve().parents[2] / "../shared/data/logs/ubx_cartrip.log"
+    if not path.is_file():
+        pytest.skip(f"{path} is not there: recorded data are kept beside the project")
+    from uavkit.core.progress import silent
+    from uavkit.formats.ubx import read_log
+
+    table = read_log(path, silent).fix_table
+    even, odd = np.arange(0, len(table), 2), np.arange(1, len(table), 2)
+    half = fix_table(
+        table.when.where(even),
+        table.latitude_deg[even],
+        table.longitude_deg[even],
+        height_ellipsoid_m=table.height_ellipsoid_m[even],
+        velocity_m_s=table.velocity_m_s[even],
+        fix_type=table.fix_type[even],
+    )
+    trajectory = build_trajectory(half)
+    found = trajectory.at(table.when.gps_ns[odd])
+    assert found.known.mean() > 0.99
+    place = (table.latitude_deg[odd], table.longitude_deg[odd], table.height_ellipsoid_m[odd])
+    error = (found.position_m - trajectory.frame.enu_from_geographic(*place))[found.known]
+    size = np.linalg.norm(error[:, :2], axis=1)
+    # At up to 32 m/s; the fixes themselves scatter by some centimetres from one to the next.
+    assert np.sqrt(np.mean(size**2)) < 0.2
+    assert np.mean(size > found.interpolation_m[found.known, 0] + 0.05) < 0.03
 
 
 def test_a_turn_of_acceleration_in_the_worst_moment_is_within_the_bound() -> None:
@@ -269,6 +300,17 @@ def test_velocities_of_another_flight_are_not_believed(wrong: str) -> None:
     error = in_frame(trajectory.at(ns(wanted))) - path.at(wanted)[0]
     assert np.sqrt(np.mean(error[:, :2] ** 2)) < 0.3
     assert not build_trajectory(table_of(t, position, velocity)).notes
+
+
+def test_velocities_are_believed_beside_noisy_positions() -> None:
+    """At 8 Hz the noise of 0.3 m makes steps of 3 m/s: the receiver's velocities are better than its differences."""
+    path, t = Wander(7), np.arange(0.0, 50.0, 0.125)
+    position, velocity = path.at(t)
+    noisy = position + np.random.default_rng(1).normal(0, 0.3, position.shape)
+    trajectory = build_trajectory(table_of(t, noisy, velocity))
+    assert not trajectory.notes
+    assert not trajectory.difference.any()
+    assert build_trajectory(table_of(t, noisy, -velocity)).notes
 
 
 def test_velocities_without_their_vertical_part_are_used() -> None:

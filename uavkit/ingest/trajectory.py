@@ -25,7 +25,9 @@ UNKNOWN_ACCELERATION_M_S2 = 10.0
 MOST_WITHOUT_HEIGHT = 0.1
 """A datum of height is taken if no more than this share of the fixes lacks it; those are left out."""
 DISBELIEVED = 0.5
-"""Velocities that differ from the way between fixes by this share of it, in the median, are none of this flight."""
+"""Velocities that differ from the way flown by this share of it, in the median, are none of this flight."""
+JUDGED_S = 5.0
+"""Time over which velocities are compared with the way flown, so that the fixes' noise does not count."""
 BOUND_SHARE = 1.0 / 3.0
 """Of the bound of the interpolation that counts as its sigma: errors hardly ever pass the bound."""
 MOST_OFF_UNDULATION_M = 10.0
@@ -61,7 +63,7 @@ class Positions:
     position_m: Array
     """(k, 3) in ``frame``."""
     velocity_m_s: Array
-    """(k, 3) east, north, up."""
+    """(k, 3) east, north, up: those of the fixes, between two of them linearly interpolated."""
     sigma_horizontal_m: Array
     """(k,) for each axis: the receiver's, and a third of the bound; NaN where the receiver states none."""
     sigma_vertical_m: Array
@@ -177,7 +179,8 @@ class Trajectory:
         p, q, v, w = (table[index] for table in (self.position_m, self.velocity_m_s) for index in (row, row + 1))
         bend, way = s * s * (3.0 - 2.0 * s), q - p
         position = p + bend * way + h * (s * (1.0 - s) ** 2 * v - s * s * (1.0 - s) * w)
-        velocity = 6.0 * s * (1.0 - s) * way / h + (1.0 - s) * (1.0 - 3.0 * s) * v + s * (3.0 * s - 2.0) * w
+        # The cubic's own slope holds the noise of both positions, 1.5 times their difference over h: too much for most.
+        velocity = (1.0 - s) * v + s * w
         by_difference = 0.25 * s * (1.0 - s) * (self.difference[row] | self.difference[row + 1])
         bound = self.change_m_s2[row] * h * h * (s * s * (1.0 - s) ** 2 + by_difference)
         sigma = (1.0 - s) * self.sigma_m[row] + s * self.sigma_m[row + 1]
@@ -360,17 +363,31 @@ def _off_the_undulation_m(table: FixTable, good: Indices) -> float:
 def _velocities(h: Array, joined: Flags, position: Array, told: Array, notes: list[str]) -> tuple[Array, Flags]:
     """Return velocities (n, 3), the receiver's where it tells them, and where they are differences, (n, 2)."""
     differences, velocity = _difference_velocities(h, joined, position), told.copy()
-    way = np.diff(position, axis=0) / h[:, None]
     for axes, name in ((slice(0, 2), "horizontal"), (slice(2, 3), "vertical")):
-        off = np.linalg.norm(way[:, axes] - 0.5 * (told[1:, axes] + told[:-1, axes]), axis=1)
-        speed = np.linalg.norm(way[:, axes], axis=1)
-        judged = joined & np.isfinite(off) & (speed > LEAST_SPEED_M_S)
-        if judged.any() and np.median(off[judged] / speed[judged]) > DISBELIEVED:
+        if _misfit(h, joined, position[:, axes], told[:, axes]) > DISBELIEVED:
             notes.append(f"the {name} velocities do not fit the positions: differences of positions take their place")
             velocity[:, axes] = np.nan
     unknown = ~np.isfinite(velocity)
     velocity[unknown] = differences[unknown]
     return velocity, np.column_stack([unknown[:, :2].any(axis=1), unknown[:, 2]])
+
+
+def _misfit(h: Array, joined: Flags, position: Array, velocity: Array) -> float:
+    """Return by what share of the way flown the velocities (n, 1 or 2) miss it, in the median over some seconds."""
+    seconds = np.concatenate([[0.0], np.cumsum(h)])
+    first = np.arange(len(seconds))
+    last = np.minimum(np.searchsorted(seconds, seconds + JUDGED_S), len(seconds) - 1)
+    step = 0.5 * (velocity[1:] + velocity[:-1]) * h[:, None]
+    good = joined & np.isfinite(step).all(axis=1)
+    flown = np.vstack([np.zeros(step.shape[1]), np.cumsum(np.where(good[:, None], step, 0.0), axis=0)])
+    bad = np.concatenate([[0], np.cumsum(~good)])
+    way = position[last] - position[first]
+    length = np.linalg.norm(way, axis=1)
+    judged = (bad[last] == bad[first]) & (length > LEAST_SPEED_M_S * (seconds[last] - seconds)) & (last > first)
+    if not judged.any():
+        return 0.0
+    off = np.linalg.norm(way - flown[last] + flown[first], axis=1)
+    return float(np.median(off[judged] / length[judged]))
 
 
 def _difference_velocities(h: Array, joined: Flags, position: Array) -> Array:
