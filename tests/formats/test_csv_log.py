@@ -182,7 +182,7 @@ def test_nothing_of_use_is_an_error(tmp_path: Path) -> None:
 
 
 def exported(tmp_path: Path) -> dict[str, bytes]:
-    files = export_log(made_log(11, count=60), tmp_path, ExportKind.CSV)
+    files = export_log(made_log(11, count=25), tmp_path, ExportKind.CSV)
     return {file.name: file.read_bytes() for file in files}
 
 

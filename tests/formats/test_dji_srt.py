@@ -175,10 +175,10 @@ def test_broken_subtitles() -> None:
         dji_srt.read_log(DATA / "broken_empty.SRT", silent)
 
 
-TEXTS = [newer(n) for n in range(1, 40)]
+TEXTS = [newer(n) for n in range(1, 20)]
 OLDER = [
     subtitle(n, f"HOME(149.0251,-20.2532) 2017.8.5 14:11:{n:02d}\nGPS(149.{n:04d},-20.2533,16) Hb:1.9\nISO:100 TV:60")
-    for n in range(1, 50)
+    for n in range(1, 25)
 ]
 
 

@@ -55,11 +55,12 @@ def test_every_field_of_a_track(tmp_path: Path) -> None:
         '<trkpt lat="35.9" lon="139.7"><time>2024-05-06T21:00:02+09:00</time><fix>none</fix></trkpt>'
         '<trkpt lat="35.9" lon="139.7"><time>2024-05-06T12:00:03</time><fix>3d</fix></trkpt>'
         '<trkpt lat="35.9" lon="139.7"><time>2024-05-06</time></trkpt>'
+        '<trkpt lat="35.9" lon="139.7"><time>6024-05-06T12:00:03Z</time></trkpt>'
     )
     log = read(tmp_path, track(body))
     table = log.fix_table
     assert table.when.gps_ns.tolist() == [
-        NOON_NS + 1_250_000_000, NO_TIME, NOON_NS + 2_000_000_000, NOON_NS + 3_000_000_000, NO_TIME,
+        NOON_NS + 1_250_000_000, NO_TIME, NOON_NS + 2_000_000_000, NOON_NS + 3_000_000_000, NO_TIME, NO_TIME,
     ]  # fmt: skip
     assert (table.latitude_deg[:2].tolist(), table.longitude_deg[:2].tolist()) == ([35.8, -35.8], [-139.65, 139.65])
     np.testing.assert_array_equal(table.height_geoid_m[:2], [50.5, np.nan])
@@ -68,10 +69,11 @@ def test_every_field_of_a_track(tmp_path: Path) -> None:
     assert np.all(np.isnan(table.sigma_horizontal_m))
     assert table.fix_type.tolist() == [
         FixType.DIFFERENTIAL, FixType.UNKNOWN, FixType.NO_FIX, FixType.THREE_DIMENSIONAL, FixType.UNKNOWN,
+        FixType.UNKNOWN,
     ]  # fmt: skip
-    assert table.satellites.tolist() == [17, 255, 255, 255, 255]
+    assert table.satellites.tolist() == [17, 255, 255, 255, 255, 255]
     assert log.damage.lost_bytes == 0
-    assert log.message_counts == {"trkpt": 5, "trkseg": 1}
+    assert log.message_counts == {"trkpt": 6, "trkseg": 1}
 
 
 def test_waypoints_are_listed_exposures(tmp_path: Path) -> None:
@@ -115,7 +117,7 @@ def test_a_cut_file_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
 
 
 def check_damage(tmp_path: Path, seed: int) -> None:
-    points = [point(n) for n in range(300)]
+    points = [point(n) for n in range(100)]
     intact = track("".join(points)).encode()
     harmed = damaged(intact, np.random.default_rng(seed))
     log = read(tmp_path, harmed.data)
@@ -190,9 +192,16 @@ def test_endless_documents_end_soon(begin: bytes, piece: bytes, message: str) ->
 
 def test_only_its_own_kind_is_recognised() -> None:
     assert gpx.recognises(track(point(1)).encode())
-    assert gpx.recognises(b"damage" + point(1).encode())
+    assert gpx.recognises(b"damage" + point(1).encode() * 3)
     assert gpx.recognises(track("").encode("utf-16"))
-    for other in (b"", b"<kml><Placemark/></kml>", b"<html>gpx</html>", b"lat,lon\n1,2\n", bytes(99)):
+    for other in (
+        b"",
+        b"<kml><Placemark/></kml>",
+        b"<html>gpx</html>",
+        b"# reads <gpx> and <trkpt>\n",
+        b"lat,lon\n1,2\n",
+        bytes(99),
+    ):
         assert not gpx.recognises(other)
 
 

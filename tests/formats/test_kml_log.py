@@ -132,19 +132,17 @@ def test_kmz(tmp_path: Path) -> None:
             read(tmp_path, data[:cut], "way.kmz")
 
 
-@pytest.mark.parametrize("told", [None, 1000])
-def test_zip_bombs_end_soon(tmp_path: Path, told: int | None) -> None:
-    body = b"<kml>" + b" " * 300_000_000
-    data = bytearray(zipped({"doc.kml": body}))
-    if told is not None:  # the size in the directory at the end is a lie
+def test_zip_bombs_end_soon(tmp_path: Path) -> None:
+    data = bytearray(zipped({"doc.kml": b"<kml>" + b" " * 270_000_000}))
+    for told in (270_000_005, 1000):  # the second is a lie
         at = data.rindex(b"PK\x01\x02") + 24
         data[at : at + 4] = struct.pack("<I", told)
-    began = time.monotonic()
-    with pytest.raises(InputError, match=r"bomb\.kmz"):
-        read(tmp_path, bytes(data), "bomb.kmz")
-    assert time.monotonic() - began < 20
-    with pytest.raises(InputError, match=r"bomb\.kmz"):
-        read_positions(tmp_path / "bomb.kmz")
+        began = time.monotonic()
+        with pytest.raises(InputError, match=r"bomb\.kmz"):
+            read(tmp_path, bytes(data), "bomb.kmz")
+        with pytest.raises(InputError, match=r"bomb\.kmz"):
+            read_positions(tmp_path / "bomb.kmz")
+        assert time.monotonic() - began < 20
 
 
 def test_entity_bombs_and_deep_nesting_are_refused(tmp_path: Path) -> None:

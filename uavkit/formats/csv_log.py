@@ -37,7 +37,17 @@ from uavkit.formats.csv_mapping import (
     mapping_to_write,
 )
 from uavkit.formats.log_bytes import DamageTally, opened
-from uavkit.formats.log_lines import Columns, Line, gps_time_of, head_text, is_place, lines_of, nanoseconds, number
+from uavkit.formats.log_lines import (
+    Columns,
+    Line,
+    gps_time_of,
+    head_text,
+    is_place,
+    lines_of,
+    nanoseconds,
+    number,
+    reported,
+)
 from uavkit.formats.log_tables import (
     CODES,
     MARK,
@@ -110,14 +120,12 @@ def read_csv_log(path: Path, mapping_path: Path, progress: Progress) -> FlightLo
 
 def _read(path: Path, declared: tuple[CsvMapping, Path] | None, progress: Progress) -> FlightLog:
     tally, first_fault = DamageTally(), ""
-    size = path.stat().st_size if path.is_file() else 0
     with opened(path) as stream:
         lines = lines_of(stream)
         comments, header = _header(path, lines)
         plan, notes = _own_plan(path, comments, header) if declared is None else _plan(path, *declared, header)
         rows = _Rows(plan)
-        for line in lines:
-            progress("reading", line.offset, size)
+        for line in reported(lines, path, progress):
             if line.text.strip() and (fault := rows.take(line.text)) is not None:
                 tally.add(line.offset, line.length, fault)
                 first_fault = first_fault or f": {fault}"

@@ -36,7 +36,7 @@ from uavkit.core.flight_log import (
 from uavkit.core.gpstime import NO_TIME, WEEK_NS
 from uavkit.core.progress import Progress
 from uavkit.formats.log_bytes import DamageTally, opened
-from uavkit.formats.log_lines import Columns, head_text, is_place, lines_of, nanoseconds, number
+from uavkit.formats.log_lines import Columns, head_text, is_place, lines_of, nanoseconds, number, reported
 
 _REAL = r"([+-]?\d{1,12}(?:\.\d{1,12})?)"
 _LINE = re.compile(
@@ -58,10 +58,8 @@ def recognises(head: bytes) -> bool:
 def read_log(path: Path, progress: Progress) -> FlightLog:
     """Read the exposures of an MRK; lines that are none are counted as damage, and an error where all are."""
     rows, tally = Columns(_NUMBERS, ("sequence", "tow_ns", "week")), DamageTally()
-    size = path.stat().st_size if path.is_file() else 0
     with opened(path) as stream:
-        for line in lines_of(stream):
-            progress("reading", line.offset, size)
+        for line in reported(lines_of(stream), path, progress):
             if not line.text.strip():
                 continue
             if (fault := _take(line.text, rows)) is not None:

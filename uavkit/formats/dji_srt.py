@@ -45,7 +45,7 @@ from uavkit.core.flight_log import (
 from uavkit.core.gpstime import NO_TIME
 from uavkit.core.progress import Progress
 from uavkit.formats.log_bytes import DamageTally, opened
-from uavkit.formats.log_lines import Columns, Line, head_text, is_place, lines_of, number
+from uavkit.formats.log_lines import Columns, Line, head_text, is_place, lines_of, number, reported
 
 MOST_LINES = 30
 """Of a subtitle; what is longer is none of DJI's."""
@@ -115,10 +115,8 @@ def recognises(head: bytes) -> bool:
 def read_log(path: Path, progress: Progress) -> FlightLog:
     """Read DJI's subtitles; those that are damaged, or not DJI's, are counted, and an error where all are."""
     found, current = _Found(), _Subtitle()
-    size = path.stat().st_size if path.is_file() else 0
     with opened(path) as stream:
-        for line in lines_of(stream):
-            progress("reading", line.offset, size)
+        for line in reported(lines_of(stream), path, progress):
             if "\0" in line.text:
                 current = _close(current, found)
                 found.tally.add(line.offset, line.length, "zero bytes")

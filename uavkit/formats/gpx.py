@@ -9,7 +9,6 @@ https://www.topografix.com/GPX/1/1/
 """
 
 import math
-import re
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -33,11 +32,10 @@ from uavkit.core.flight_log import (
 )
 from uavkit.core.progress import Progress
 from uavkit.formats.log_bytes import DamageTally, opened
-from uavkit.formats.log_lines import Columns, gps_time_of, head_text, is_place, number
-from uavkit.formats.xml_records import XmlKind, XmlReader, local
+from uavkit.formats.log_lines import Columns, gps_time_of, head_text, is_place, number, reported
+from uavkit.formats.xml_records import XmlKind, XmlReader, is_xml_of, local
 
 KIND = XmlKind(name="GPX", records=frozenset({"trkpt", "wpt", "rtept"}), resume=b"<gpx><trk><trkseg>")
-_ROOT = re.compile(r"<(?:[\w-]{1,40}:)?(?:gpx|trkpt|rtept|wpt)[\s>]")
 _NUMBERS = ("latitude", "longitude", "elevation", "geoid", "speed", "course", "fix", "satellites")
 _FIX_TYPES = {
     "none": FixType.NO_FIX,
@@ -57,18 +55,16 @@ class _Points:
 
 def recognises(head: bytes) -> bool:
     """Tell whether the first bytes of a file are of GPX."""
-    return _ROOT.search(head_text(head)) is not None
+    return is_xml_of(head_text(head), "gpx", "(?:trkpt|wpt|rtept)")
 
 
 def read_log(path: Path, progress: Progress) -> FlightLog:
     """Read a GPX file; broken points are counted as damage, and an error where none is whole."""
     tally, points = DamageTally(), {name: _Points() for name in ("trkpt", "wpt", "rtept")}
     reader = XmlReader(str(path), KIND, tally)
-    size = path.stat().st_size if path.is_file() else 0
     first_fault = ""
     with opened(path) as stream:
-        for record in reader.records(stream):
-            progress("reading", record.offset, size)
+        for record in reported(reader.records(stream), path, progress):
             fault = _take(record.element, points[record.element.tag])
             if fault is not None:
                 tally.add(record.offset, record.length, fault)

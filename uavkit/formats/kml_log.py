@@ -45,11 +45,10 @@ from uavkit.core.flight_log import (
 from uavkit.core.progress import Progress
 from uavkit.formats.kml_document import child_text, local_name, main_document
 from uavkit.formats.log_bytes import DamageTally, opened
-from uavkit.formats.log_lines import Columns, gps_time_of, head_text, is_place, number
-from uavkit.formats.xml_records import XmlKind, XmlReader
+from uavkit.formats.log_lines import Columns, gps_time_of, head_text, is_place, number, reported
+from uavkit.formats.xml_records import XmlKind, XmlReader, is_xml_of
 
 KIND = XmlKind(name="KML", records=frozenset({"Placemark"}), resume=b"<kml><Document>")
-_ROOT = re.compile(r"<(?:[\w-]{1,40}:)?(?:kml|Placemark)[\s>]|<gx:coord>")
 _ZIP = b"PK\x03\x04"
 _NUMBERS = ("latitude", "longitude", "geoid_m", "home_m")
 _LONGEST_NAME = 200
@@ -79,7 +78,7 @@ def recognises(head: bytes) -> bool:
     """Tell whether the first bytes of a file are of KML, or of a zip archive with a .kml among its first files."""
     if head.startswith(_ZIP):
         return b".kml" in head.lower()
-    return _ROOT.search(head_text(head)) is not None
+    return is_xml_of(head_text(head), "kml", "(?:Placemark|gx:coord)")
 
 
 def read_log(path: Path, progress: Progress) -> FlightLog:
@@ -90,9 +89,8 @@ def read_log(path: Path, progress: Progress) -> FlightLog:
     tally, found = DamageTally(), _Found()
     reader = XmlReader(str(path), KIND, tally)
     try:
-        with _document(path) as (stream, size):
-            for record in reader.records(stream):
-                progress("reading", record.offset, size)
+        with _document(path) as stream:
+            for record in reported(reader.records(stream), path, progress):
                 fault = _take(record.element, found)
                 if fault:
                     tally.add(record.offset, record.length, fault)
@@ -111,17 +109,15 @@ def read_log(path: Path, progress: Progress) -> FlightLog:
 
 
 @contextmanager
-def _document(path: Path) -> Iterator[tuple[BinaryIO, int]]:
-    """Open the document, unpacked, with its size as it is said to be."""
+def _document(path: Path) -> Iterator[BinaryIO]:
+    """Open the document, unpacked."""
     with opened(path) as stream:
         if stream.read(4) != _ZIP:
             stream.seek(0)
-            yield stream, path.stat().st_size
+            yield stream
             return
-        with zipfile.ZipFile(stream) as archive:
-            main = main_document(path, archive)
-            with archive.open(main) as unpacked:
-                yield cast(BinaryIO, unpacked), main.file_size
+        with zipfile.ZipFile(stream) as archive, archive.open(main_document(path, archive)) as unpacked:
+            yield cast(BinaryIO, unpacked)
 
 
 def _anything(found: _Found) -> bool:

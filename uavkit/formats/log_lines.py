@@ -3,18 +3,23 @@
 import math
 import re
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import BinaryIO
+from pathlib import Path
+from typing import BinaryIO, Protocol, TypeVar
 
 import numpy as np
 
 from uavkit.core.arrays import Array, Indices
 from uavkit.core.gpstime import NO_TIME, gps_time_ns_from_utc
+from uavkit.core.progress import Progress
 
 LONGEST_LINE = 64 * 1024
 """Bytes; what is longer is no line of a log and comes in pieces."""
+_REPORT_BYTES = 1024 * 1024
+_LAST_YEAR = 2200
+"""Later ones are nonsense, and beyond 64 bits of nanoseconds."""
 _NUMBER = re.compile(r"[+-]?(?:\d{1,40}(?:\.\d{0,40})?|\.\d{1,40})(?:[eE][+-]?\d{1,3})?")
 _SECONDS = re.compile(r"([+-]?)(\d{1,19})(?:\.(\d{1,18}))?")
 
@@ -45,6 +50,28 @@ def lines_of(stream: BinaryIO) -> Iterator[Line]:
         offset += len(raw)
 
 
+class _Placed(Protocol):
+    """Something at a place in a file."""
+
+    @property
+    def offset(self) -> int:
+        """Of its first byte."""
+
+
+PlacedT = TypeVar("PlacedT", bound=_Placed)
+
+
+def reported(things: Iterable[PlacedT], path: Path, progress: Progress) -> Iterator[PlacedT]:
+    """Yield what is read of a file, and tell how far reading is, each megabyte."""
+    size, next_offset = path.stat().st_size if path.is_file() else 0, 0
+    for thing in things:
+        if thing.offset >= next_offset:
+            progress("reading", thing.offset, max(size, thing.offset))  # of a KMZ the offset is in what it unpacks to
+            next_offset = thing.offset + _REPORT_BYTES
+        yield thing
+    progress("reading", size, size)
+
+
 def head_text(head: bytes) -> str:
     """Return the first bytes of a file as text, whatever they are; UTF-16 only where a byte order mark says so."""
     encoding = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
@@ -73,12 +100,14 @@ def nanoseconds(text: str, digits: int = 9) -> int | None:
 
 
 def gps_time_of(text: str) -> int | None:
-    """Return the GPS time of an ISO 8601 instant, UTC where it names no zone; None for a date alone."""
+    """Return the GPS time of an ISO 8601 instant, UTC where it names no zone; None for a date alone, or nonsense."""
     text = text.strip()
     if len(text) < 16:
         return None
     try:
         moment = datetime.fromisoformat(text)
+        if moment.year > _LAST_YEAR:
+            return None
         return gps_time_ns_from_utc((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).astimezone(UTC))
     except (ValueError, OverflowError):
         return None

@@ -26,6 +26,8 @@ LONGEST_TAG = 1024 * 1024
 MOST_BREAKS = 5000
 """Places where reading is taken up again; what has more of them is no XML."""
 _MOST_NAMES = 1000
+_FEW_RECORDS = 3
+"""That tell the kind of a document whose begin is lost."""
 _CHUNK = 128 * 1024
 
 
@@ -48,6 +50,14 @@ class XmlRecord:
     element: ElementTree.Element
     offset: int
     length: int
+
+
+def is_xml_of(text: str, root: str, record: str) -> bool:
+    """Tell whether the begin of a text is XML with such a root, or what is left of it, by some of its records."""
+    prefix = r"<(?:[\w-]{1,40}:)?"
+    if text.lstrip().startswith("<") and re.search(rf"{prefix}(?:{root}|{record})[\s>]", text):
+        return True
+    return len(re.findall(rf"{prefix}{record}[\s>]", text)) >= _FEW_RECORDS
 
 
 def local(name: str) -> str:
