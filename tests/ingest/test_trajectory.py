@@ -331,6 +331,48 @@ def test_a_flight_across_the_date_line() -> None:
     np.testing.assert_allclose(found, [[-17.0, -179.999975, 30.0], [-17.0, 179.999975, 30.0]], rtol=0, atol=1e-7)
 
 
+_WILD = st.one_of(st.floats(width=64), st.floats(-90.0, 90.0))
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.one_of(st.sampled_from([NO_TIME, 0, 2**63 - 1]), st.integers(START_NS, START_NS + 10**10)),
+            st.tuples(*[_WILD] * 10),
+            st.integers(0, 255),
+            st.integers(0, 2),
+        ),
+        max_size=12,
+    )
+)
+@settings(max_examples=80, deadline=None)
+def test_damaged_tables_end_in_an_error_or_a_trajectory(
+    rows: list[tuple[int, tuple[float, ...], int, int]],
+) -> None:
+    values = np.array([row[1] for row in rows]).reshape(-1, 10)
+    table = fix_table(
+        Stamps.of(len(rows), gps_ns=np.array([row[0] for row in rows], dtype=np.int64)),
+        values[:, 0],
+        values[:, 1],
+        height_ellipsoid_m=values[:, 2],
+        height_geoid_m=values[:, 3],
+        height_above_home_m=values[:, 4],
+        velocity_m_s=values[:, 5:8],
+        sigma_horizontal_m=values[:, 8],
+        sigma_vertical_m=values[:, 9],
+        fix_type=np.array([row[2] for row in rows], dtype=np.uint8),
+        receiver=np.array([row[3] for row in rows], dtype=np.uint8),
+    )
+    try:
+        trajectory = build_trajectory(table)
+    except InputError:
+        return
+    assert np.all(np.diff(trajectory.gps_ns) > 0)
+    found = trajectory.at(np.array([START_NS + 5 * 10**9, *(row[0] for row in rows)], dtype=np.int64))
+    assert np.isfinite(found.position_m[found.known]).all()
+    assert len(found.fixes()) == len(rows) + 1
+
+
 def test_too_little_is_an_error() -> None:
     t = np.arange(0.0, 5.0)
     table = table_of(t, *straight(t))

@@ -32,6 +32,10 @@ BOUND_SHARE = 1.0 / 3.0
 """Of the bound of the interpolation that counts as its sigma: errors hardly ever pass the bound."""
 MOST_OFF_UNDULATION_M = 10.0
 """Receivers' geoids are coarse: within this of EGM96, their undulation is believed."""
+MOST_HEIGHT_M = 100_000.0
+"""Heights beyond are damage."""
+MOST_SPEED_M_S = 1000.0
+"""Velocities beyond are damage."""
 LEAST_SPEED_M_S = 0.5
 """Slower than this, velocities are not judged."""
 
@@ -253,7 +257,7 @@ def build_trajectory(table: FixTable, options: TrajectoryOptions = TrajectoryOpt
     return _trajectory(
         (frame, datum, options),
         (table.when.gps_ns[good], lost_ns),
-        (position_m, table.velocity_m_s[good], sigma_m),
+        (position_m, _within(table.velocity_m_s[good], MOST_SPEED_M_S), sigma_m),
         notes,
     )
 
@@ -309,7 +313,7 @@ def _usable(table: FixTable, rows: Indices) -> Flags:
     """Return which rows have a fix in three dimensions (or do not say), a place on earth and a time."""
     latitude, longitude = table.latitude_deg[rows], table.longitude_deg[rows]
     on_earth = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 180.0)
-    known = (table.fix_type[rows] >= FixType.THREE_DIMENSIONAL) & (table.when.gps_ns[rows] != NO_TIME)
+    known = (table.fix_type[rows] >= FixType.THREE_DIMENSIONAL) & (table.when.gps_ns[rows] > 0)  # nor NO_TIME
     return np.asarray(on_earth & known, dtype=np.bool_)
 
 
@@ -318,20 +322,20 @@ def _lost_times(table: FixTable, rows: Indices, good: Indices) -> Indices:
     without = rows[table.fix_type[rows] < FixType.THREE_DIMENSIONAL]
     times = table.when.gps_ns[without]
     before = np.searchsorted(good, without) - 1
-    untimed = times == NO_TIME
+    untimed = times <= 0
     if len(good):
         times = np.where(untimed & (before >= 0), table.when.gps_ns[good[np.maximum(before, 0)]] + 1, times)
-    return np.unique(times[times != NO_TIME])
+    return np.unique(times[times > 0])
 
 
 def _heights(table: FixTable, good: Indices, notes: list[str]) -> tuple[HeightDatum, Array]:
     """Return the datum of the heights and the heights (k,), NaN where a fix lacks it; zeros where none has any."""
     columns = [
-        (HeightDatum.ELLIPSOID, table.height_ellipsoid_m[good]),
-        (HeightDatum.GEOID, table.height_geoid_m[good]),
-        (HeightDatum.GROUND, table.height_above_home_m[good]),
+        (HeightDatum.ELLIPSOID, _within(table.height_ellipsoid_m[good], MOST_HEIGHT_M)),
+        (HeightDatum.GEOID, _within(table.height_geoid_m[good], MOST_HEIGHT_M)),
+        (HeightDatum.GROUND, _within(table.height_above_home_m[good], MOST_HEIGHT_M)),
     ]
-    off_m = _off_the_undulation_m(table, good)
+    off_m = _off_the_undulation_m(table, good, columns[0][1] - columns[1][1])
     if off_m > MOST_OFF_UNDULATION_M:
         notes.append(
             f"ellipsoidal heights less those above the geoid miss the geoid's undulation by {off_m:.0f} m: those above "
@@ -346,12 +350,16 @@ def _heights(table: FixTable, good: Indices, notes: list[str]) -> tuple[HeightDa
     return columns[least] if missing[least] < 1.0 else (HeightDatum.UNKNOWN, np.zeros(len(good)))
 
 
-def _off_the_undulation_m(table: FixTable, good: Indices) -> float:
+def _within(values: Array, most: float) -> Array:
+    """Return values with NaN in place of those that are larger than any can be."""
+    return np.where(np.abs(values) <= most, values, np.nan)
+
+
+def _off_the_undulation_m(table: FixTable, good: Indices, undulation_m: Array) -> float:
     """Return by how much the two heights of the fixes differ otherwise than ellipsoid and geoid do; 0 if not told.
 
-    Receivers and simulators that do not know the undulation give one height for the other.
+    ``undulation_m`` (k,) is their difference. Receivers and simulators that do not know it give one for the other.
     """
-    undulation_m = table.height_ellipsoid_m[good] - table.height_geoid_m[good]
     both = good[np.isfinite(undulation_m)]
     if len(both) == 0:
         return 0.0
