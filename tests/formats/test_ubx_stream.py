@@ -237,7 +237,7 @@ def test_any_payload_of_any_message_is_read(tmp_path_factory: pytest.TempPathFac
 def test_hostile_streams_take_bounded_time() -> None:
     """Beginnings of the longest frames, over and over: each fails, and none may cost its length."""
     found(made.pvt(0))
-    n = 300_000
+    n = 3_000_000
     for pattern in (
         b"\xb5\x62\x01\x07\xff\xff",
         b"\xd3\x03\xff",
@@ -249,7 +249,7 @@ def test_hostile_streams_take_bounded_time() -> None:
     ):
         begin = time.perf_counter()
         places, tally = found(pattern * (n // len(pattern)), 100_000)
-        assert time.perf_counter() - begin < 5.0, f"{pattern!r}"
+        assert time.perf_counter() - begin < 4.0, f"{pattern!r}"
         assert places == []
         assert tally.result().lost_bytes == n // len(pattern) * len(pattern)
 
@@ -267,7 +267,7 @@ def test_memory_stays_bounded(tmp_path: Path) -> None:
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert len(log.fix_table) == 400
-    assert peak < 8 * receiver_stream.BLOCK_BYTES
+    assert peak < 18 * receiver_stream.BLOCK_BYTES
 
 
 def test_two_logs_at_once() -> None:

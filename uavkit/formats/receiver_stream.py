@@ -8,10 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavkit.core.arrays import Indices
-from uavkit.formats.kernels.ubx_frames import NMEA, RTCM3, UBX, crc24q_table, running_sums, scan
+from uavkit.formats.kernels.ubx_frames import (
+    NMEA,
+    RTCM3,
+    UBX,
+    Found,
+    Sums,
+    crc24q_powers,
+    crc24q_table,
+    running_sums,
+    scan,
+)
 from uavkit.formats.log_bytes import Blocks, DamageTally
 
-BLOCK_BYTES = 2 * 1024 * 1024
+BLOCK_BYTES = 1024 * 1024
 MOST_AT_ONCE = 65_536
 """Messages of one batch."""
 HEAD_BYTES = 64 * 1024
@@ -56,29 +66,50 @@ def batches(stream: BinaryIO, tally: DamageTally, block_bytes: int = BLOCK_BYTES
     """
     unchecked = not has_checked_sentences(stream.read(HEAD_BYTES))
     stream.seek(0)
-    blocks, table, consumed, lost_from = Blocks(stream, block_bytes), crc24q_table(), 0, 0
+    blocks, consumed, lost_from = Blocks(stream, block_bytes), 0, 0
+    tables = _crc_tables()
     while (block := blocks.next(consumed)) is not None:
-        plain, weighted = running_sums(block)
+        sums = _sums(block, tables)
         consumed, more = 0, False
         while consumed < len(block) and not more:
-            batch, consumed, more = _scan(block, blocks, consumed, unchecked, (plain, weighted, table))
+            found = _room(min(MOST_AT_ONCE, (len(block) - consumed) // 6 + 1))
+            consumed, count, more = scan(block, consumed, blocks.final, unchecked, sums, found)
+            batch = _batch(block, blocks.offset, found, count)
             lost_from = _count_gaps(batch, lost_from, blocks.offset + consumed, tally)
-            if len(batch.kinds):
+            if count:
                 yield batch
 
 
-Sums = tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint32]]
+Tables = tuple[NDArray[np.uint32], NDArray[np.uint32]]
 
 
-def _scan(block: NDArray[np.uint8], blocks: Blocks, begin: int, unchecked: bool, sums: Sums) -> tuple[Batch, int, bool]:
-    room = min(MOST_AT_ONCE, (len(block) - begin) // 6 + 1)
-    kinds, codes = np.empty(room, dtype=np.uint8), np.empty(room, dtype=np.int64)
-    places = np.empty((room, 2), dtype=np.int64)
-    consumed, count, more = scan(block, begin, blocks.final, unchecked, *sums, kinds, places, codes)
-    batch = Batch(
-        block=block, offset=blocks.offset, kinds=kinds[:count], places=places[:count], codes=codes[:count]
-    )  # fmt: skip
-    return batch, consumed, more
+def _crc_tables() -> Tables:
+    table = crc24q_table()
+    return table, crc24q_powers(table)
+
+
+def _sums(block: NDArray[np.uint8], tables: Tables) -> Sums:
+    plain, weighted = running_sums(block)
+    crc, until = np.empty(len(block) + 1, dtype=np.uint32), np.full(1, -1, dtype=np.int64)
+    return Sums(plain=plain, weighted=weighted, crc=crc, crc_until=until, table=tables[0], powers=tables[1])
+
+
+def _room(count: int) -> Found:
+    return Found(
+        kinds=np.empty(count, dtype=np.uint8),
+        places=np.empty((count, 2), dtype=np.int64),
+        codes=np.empty(count, dtype=np.int64),
+    )
+
+
+def _batch(block: NDArray[np.uint8], offset: int, found: Found, count: int) -> Batch:
+    return Batch(
+        block=block,
+        offset=offset,
+        kinds=found.kinds[:count],
+        places=found.places[:count],
+        codes=found.codes[:count],
+    )
 
 
 def _count_gaps(batch: Batch, lost_from: int, decided: int, tally: DamageTally) -> int:
@@ -105,11 +136,9 @@ def _why(head: bytes) -> str:
 def messages_of(head: bytes, unchecked: bool = False) -> Batch:
     """Return the intact messages of the first bytes of a stream; ``unchecked`` as in ``scan``."""
     block = np.frombuffer(head, dtype=np.uint8)
-    room = len(block) // 6 + 1
-    kinds, codes = np.empty(room, dtype=np.uint8), np.empty(room, dtype=np.int64)
-    places = np.empty((room, 2), dtype=np.int64)
-    _, count, _ = scan(block, 0, True, unchecked, *running_sums(block), crc24q_table(), kinds, places, codes)
-    return Batch(block=block, offset=0, kinds=kinds[:count], places=places[:count], codes=codes[:count])
+    found = _room(len(block) // 6 + 1)
+    _, count, _ = scan(block, 0, True, unchecked, _sums(block, _crc_tables()), found)
+    return _batch(block, 0, found, count)
 
 
 def has_checked_sentences(head: bytes) -> bool:

@@ -4,6 +4,8 @@ Sources: u-blox 8 / M8 and ZED-F9P interface descriptions (frame structure, chec
 RTCM 10403 (transport layer, CRC-24Q).
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +17,37 @@ LONGEST_SENTENCE = 1024
 _MORE, _NOTHING = -1, 0
 
 
+class Sums(NamedTuple):
+    """What lets the checksum of any stretch of a block be told without a loop over it; n is the block's length.
+
+    A false beginning of a frame then costs the same whatever length it claims.
+    """
+
+    plain: NDArray[np.uint8]
+    """(n + 1,) sums of the bytes before each place, modulo 256."""
+    weighted: NDArray[np.uint8]
+    """(n + 1,) sums of the bytes times their place, modulo 256."""
+    crc: NDArray[np.uint32]
+    """(n + 1,) CRC-24Q of the bytes before each place, from some place on and up to ``crc_until``."""
+    crc_until: NDArray[np.int64]
+    """(1,) up to where ``crc`` is known."""
+    table: NDArray[np.uint32]
+    """(256,) of ``crc24q_table``."""
+    powers: NDArray[np.uint32]
+    """(11, 3, 256) of ``crc24q_powers``."""
+
+
+class Found(NamedTuple):
+    """The messages of a block, room for m of them."""
+
+    kinds: NDArray[np.uint8]
+    """(m,) UBX, NMEA or RTCM3."""
+    places: NDArray[np.int64]
+    """(m, 2) begin and length in the block."""
+    codes: NDArray[np.int64]
+    """(m,) class * 256 + number of a u-blox frame, the address of a sentence, the number of an RTCM message."""
+
+
 def crc24q_table() -> NDArray[np.uint32]:
     """Return the table of CRC-24Q (polynomial 0x1864CFB) for single bytes, (256,)."""
     table = np.arange(256, dtype=np.uint32) << np.uint32(16)
@@ -23,12 +56,20 @@ def crc24q_table() -> NDArray[np.uint32]:
     return np.asarray(table & np.uint32(0xFFFFFF), dtype=np.uint32)
 
 
+def crc24q_powers(table: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """Return what 1, 2, 4, ... 1024 zero bytes make of a CRC, (11, 3, 256): by each of its bytes, the lowest first."""
+    values = np.arange(256, dtype=np.uint32)
+    one = [((values << np.uint32(8 * b + 8)) & 0xFFFFFF) ^ (table if b == 2 else np.uint32(0)) for b in range(3)]
+    powers = [np.array(one, dtype=np.uint32)]
+    for _ in range(10):
+        last = powers[-1]
+        powers.append(last[0][last & 255] ^ last[1][last >> 8 & 255] ^ last[2][last >> 16])
+    return np.array(powers, dtype=np.uint32)
+
+
 @kernel
 def running_sums(block: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return sums modulo 256 of the bytes before each place and of the bytes times their place, (n + 1,) each.
-
-    With them the checksum of any stretch takes no loop, so that false frames of 64 KiB cost nothing.
-    """
+    """Return sums modulo 256 of the bytes before each place and of the bytes times their place, (n + 1,) each."""
     n = len(block)
     plain, weighted = np.zeros(n + 1, dtype=np.uint8), np.zeros(n + 1, dtype=np.uint8)
     a, b = 0, 0
@@ -41,9 +82,7 @@ def running_sums(block: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[n
 
 
 @kernel
-def _ubx_length(
-    block: NDArray[np.uint8], i: int, final: bool, plain: NDArray[np.uint8], weighted: NDArray[np.uint8]
-) -> int:
+def _ubx_length(block: NDArray[np.uint8], i: int, final: bool, sums: Sums) -> int:
     """Return the length of the frame that begins at i, 0 where none does, -1 where more bytes must be seen.
 
     Fletcher's second sum over bytes s to e is the sum of (e - place) * byte.
@@ -56,13 +95,32 @@ def _ubx_length(
     end = i + 6 + block[i + 4] + 256 * block[i + 5]
     if end + 2 > n:
         return _NOTHING if final else _MORE
-    a = (int(plain[end]) - int(plain[i + 2])) & 255
-    b = ((end & 255) * a - (int(weighted[end]) - int(weighted[i + 2]))) & 255
+    a = (int(sums.plain[end]) - int(sums.plain[i + 2])) & 255
+    b = ((end & 255) * a - (int(sums.weighted[end]) - int(sums.weighted[i + 2]))) & 255
     return end + 2 - i if a == block[end] and b == block[end + 1] else _NOTHING
 
 
 @kernel
-def _rtcm_length(block: NDArray[np.uint8], i: int, final: bool, table: NDArray[np.uint32]) -> int:
+def _crc(block: NDArray[np.uint8], begin: int, end: int, sums: Sums) -> int:
+    """Return CRC-24Q of bytes begin to end, at most 2047, from those of all bytes before each."""
+    if begin > sums.crc_until[0]:
+        sums.crc_until[0], sums.crc[begin] = begin, 0
+    for j in range(sums.crc_until[0], end):
+        crc = int(sums.crc[j])
+        sums.crc[j + 1] = ((crc << 8) & 0xFFFFFF) ^ int(sums.table[(crc >> 16) ^ block[j]])
+    sums.crc_until[0] = max(int(sums.crc_until[0]), end)
+    before, length, power = int(sums.crc[begin]), end - begin, 0
+    while length:
+        if length & 1:
+            t = sums.powers[power]
+            before = int(t[0, before & 255]) ^ int(t[1, (before >> 8) & 255]) ^ int(t[2, before >> 16])
+        length >>= 1
+        power += 1
+    return int(sums.crc[end]) ^ before
+
+
+@kernel
+def _rtcm_length(block: NDArray[np.uint8], i: int, final: bool, sums: Sums) -> int:
     """Return the length of the RTCM 3 frame that begins at i, 0 where none does, -1 where more must be seen."""
     n = len(block)
     if i + 1 < n and block[i + 1] > 3:
@@ -72,11 +130,8 @@ def _rtcm_length(block: NDArray[np.uint8], i: int, final: bool, table: NDArray[n
     end = i + 3 + (block[i + 1] & 3) * 256 + block[i + 2]
     if end + 3 > n:
         return _NOTHING if final else _MORE
-    crc = 0
-    for j in range(i, end):
-        crc = ((crc << 8) & 0xFFFFFF) ^ int(table[(crc >> 16) ^ block[j]])
     told = block[end] * 65536 + block[end + 1] * 256 + block[end + 2]
-    return end + 3 - i if crc == told else _NOTHING
+    return end + 3 - i if _crc(block, i, end, sums) == told else _NOTHING
 
 
 @kernel
@@ -147,33 +202,33 @@ def _address(block: NDArray[np.uint8], i: int) -> int:
 
 
 @kernel
-def scan(
-    block: NDArray[np.uint8],
-    begin: int,
-    final: bool,
-    unchecked: bool,
-    plain: NDArray[np.uint8],
-    weighted: NDArray[np.uint8],
-    table: NDArray[np.uint32],
-    kinds: NDArray[np.uint8],
-    places: NDArray[np.int64],
-    codes: NDArray[np.int64],
-) -> tuple[int, int, bool]:
-    """Find the intact messages of a block from ``begin`` on, as many as ``kinds`` (m,) has room for.
+def _code(block: NDArray[np.uint8], i: int, kind: int, length: int) -> int:
+    """Return the code of the message at i."""
+    if kind == UBX:
+        return int(block[i + 2]) * 256 + int(block[i + 3])
+    if kind == NMEA:
+        return _address(block, i)
+    return (int(block[i + 3]) << 4 | int(block[i + 4]) >> 4) if length >= 8 else 0
 
-    Writes the kind of each, its begin and length (m, 2) in the block, and its code: class and number of a u-blox
-    frame (class * 256 + number), the address of a sentence, the number of an RTCM message. What fails is tried again
-    one byte later. Returns how far the block is decided, how many messages there are, and whether more is needed.
+
+@kernel
+def scan(
+    block: NDArray[np.uint8], begin: int, final: bool, unchecked: bool, sums: Sums, found: Found
+) -> tuple[int, int, bool]:
+    """Find the intact messages of a block from ``begin`` on, as many as ``found`` has room for.
+
+    What fails is tried again one byte later. Returns how far the block is decided, how many messages there are, and
+    whether more bytes are needed; with ``final`` there are none. ``unchecked`` as in ``_nmea_length``.
     """
     i, n, count = begin, len(block), 0
-    while i < n and count < len(kinds):
+    while i < n and count < len(found.kinds):
         byte = block[i]
         if byte == 0xB5:
-            kind, length = UBX, _ubx_length(block, i, final, plain, weighted)
+            kind, length = UBX, _ubx_length(block, i, final, sums)
         elif byte == 36:
             kind, length = NMEA, _nmea_length(block, i, final, unchecked)
         elif byte == 0xD3:
-            kind, length = RTCM3, _rtcm_length(block, i, final, table)
+            kind, length = RTCM3, _rtcm_length(block, i, final, sums)
         else:
             i += 1
             continue
@@ -182,14 +237,9 @@ def scan(
         if length == _NOTHING:
             i += 1
             continue
-        kinds[count] = kind
-        places[count, 0], places[count, 1] = i, length
-        if kind == UBX:
-            codes[count] = int(block[i + 2]) * 256 + int(block[i + 3])
-        elif kind == NMEA:
-            codes[count] = _address(block, i)
-        else:
-            codes[count] = (int(block[i + 3]) << 4 | int(block[i + 4]) >> 4) if length >= 8 else 0
+        found.kinds[count] = kind
+        found.places[count, 0], found.places[count, 1] = i, length
+        found.codes[count] = _code(block, i, kind, length)
         count += 1
         i += length
     return i, count, False
