@@ -186,6 +186,17 @@ def test_attitudes(axis: int, name: str, tmp_path: Path) -> None:
     assert table.when.boot_ns.tolist() == [1_990_000_000, 2_020_000_000]
 
 
+def test_attitude_of_three_turns(tmp_path: Path) -> None:
+    """First yaw, then pitch, then roll: the product of the three quaternions."""
+    roll, pitch, yaw = np.radians([20.0, -35.0, 140.0])
+    cr, sr, cp, sp, cy, sy = (f(angle / 2.0) for angle in (roll, pitch, yaw) for f in (np.cos, np.sin))
+    q = (cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy,
+         cr * cp * sy - sr * sp * cy)  # fmt: skip
+    log = Made().format("vehicle_attitude", "uint64_t timestamp", "float[4] q").subscribe(0, "vehicle_attitude")
+    table = read(log.row(0, "uint64_t float float float float", 2_000_000, *q), tmp_path).attitude_table
+    assert (table.roll_rad[0], table.pitch_rad[0], table.yaw_rad[0]) == pytest.approx((roll, pitch, yaw), abs=1e-6)
+
+
 def exposures_log() -> Made:
     log = Made().format("camera_capture", *CAPTURE).format("camera_trigger", *TRIGGER)
     return log.subscribe(0, "camera_capture").subscribe(1, "camera_trigger")

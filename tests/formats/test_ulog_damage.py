@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tests.formats.log_damage import Damaged, damaged
-from tests.formats.ulog_made import SYNC, Message, flight, messages
+from tests.formats.ulog_made import SYNC, Made, Message, flight, messages
 from uavkit.core.errors import InputError
 from uavkit.core.flight_log import FlightLog
 from uavkit.core.progress import silent
@@ -214,6 +214,25 @@ def test_subscription_lost(tmp_path: Path) -> None:
     assert log.damage.lost_bytes == 0
     assert log.message_counts["data of number 0"] == 120
     assert any("subscription is lost" in note for note in log.notes)
+
+
+def test_rows_without_subscription_follow_one_another(tmp_path: Path) -> None:
+    log = Made().format("cpuload", "uint64_t timestamp", "float load").text_information("sys_name", "PX4")
+    for k in range(6):
+        log.row(7, "uint64_t float", 1_000_000 * k + 1, 0.5)
+    told = read(bytes(log.data), tmp_path)
+    assert told.damage.lost_bytes == 0
+    assert told.message_counts["data of number 7"] == 6
+
+
+def test_bytes_like_a_short_message_among_damage(tmp_path: Path) -> None:
+    """Three bytes make a dropout or the end of a subscription: after damage they count only before another message."""
+    data = flight()
+    at = messages(data)[-20].begin
+    noise = bytes(10) + b"\x02\x00O\x99\x99" + bytes(10) + b"\x02\x00R\x01\x00" + bytes(10)
+    told = read(data[:at] + noise + data[at:], tmp_path)
+    assert told.damage.lost_bytes == len(noise)
+    assert told.message_counts == read(data, tmp_path).message_counts
 
 
 def test_format_lost(tmp_path: Path) -> None:
