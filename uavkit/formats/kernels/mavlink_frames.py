@@ -7,11 +7,11 @@ message's definition) are those of the MAVLink developer guide, "Packet Serializ
 import numpy as np
 from numpy.typing import NDArray
 
-from uavkit.core.arrays import Indices
 from uavkit.formats.kernels.jit import kernel
 
 Bytes = NDArray[np.uint8]
 Table = NDArray[np.int16]
+Indices = NDArray[np.int64]
 
 STAMP_BYTES = 8
 """Before each frame of a telemetry log: Unix time in microseconds, most significant byte first."""
