@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from tests.formats import receiver_bytes as made
 from tests.formats.log_damage import damaged
 from uavkit.core.errors import InputError
+from uavkit.core.gpstime import gps_time_ns_from_week
 from uavkit.core.progress import silent
 from uavkit.formats import nmea, receiver_stream, ubx
 from uavkit.formats.log_bytes import DamageTally
@@ -94,16 +95,11 @@ def test_every_untouched_position_and_mark_is_read_with_its_content(tmp_path: Pa
         for n, (message, end) in enumerate(zip(messages, ends, strict=True)):
             if hurt.moved(end - len(message), end) is not None:
                 assert (350_000_000 + n) / 1e7 in latitudes if n % 3 else n in sequences, f"seed {seed} message {n}"
-        table = log.exposure_table
-        assert table.when.gps_ns.tolist() == [
-            made_time + number for number in table.sequence.tolist() for made_time in [_mark_ns(number)]
+        marks = log.exposure_table
+        expected = [
+            gps_time_ns_from_week(made.WEEK, 200_000_000 * number) + number for number in marks.sequence.tolist()
         ]
-
-
-def _mark_ns(number: int) -> int:
-    from uavkit.core.gpstime import gps_time_ns_from_week
-
-    return gps_time_ns_from_week(made.WEEK, 200 * number * 1_000_000)
+        assert marks.when.gps_ns.tolist() == expected
 
 
 def test_reading_does_not_depend_on_blocks() -> None:
