@@ -88,6 +88,12 @@ def test_lines_that_are_none_are_lost_bytes(tmp_path: Path) -> None:
     assert [span.offset for span in log.damage.spans] == [len(line(1)) + 1, len(line(1)) + 1 + len(bad) + len(line(2))]
 
 
+def test_a_line_right_behind_zero_bytes_is_found(tmp_path: Path) -> None:
+    log = read(tmp_path, line(1)[:-20] + "\0" * 50 + line(2))
+    assert log.exposure_table.sequence.tolist() == [2]
+    assert log.damage.lost_bytes == len(line(1)) - 20 + 50
+
+
 def test_only_its_own_kind_is_recognised() -> None:
     assert dji_mrk.recognises(line(1).encode())
     for other in (

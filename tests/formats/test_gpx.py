@@ -109,11 +109,22 @@ def test_points_that_are_no_place_are_lost_bytes(tmp_path: Path) -> None:
 
 def test_a_cut_file_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     text = track("".join(point(n) for n in range(100)))
-    cut = text[: text.index(point(70)) + 40]
-    log = read(tmp_path, cut)
-    assert len(log.fix_table) == 70
-    assert (log.damage.lost_bytes, log.damage.spans[0].offset) == (40, len(cut) - 40)
-    assert any("not well-formed" in note for note in log.notes)
+    for more in (3, 40, 60, 80):  # within the begin tag, and within what it holds
+        cut = text[: text.index(point(70)) + more]
+        log = read(tmp_path, cut)
+        assert len(log.fix_table) == 70
+        assert (log.damage.lost_bytes, log.damage.spans[0].offset) == (more, len(cut) - more)
+        assert any("not well-formed" in note for note in log.notes)
+
+
+def test_a_point_without_its_end_does_not_take_the_next_with_it(tmp_path: Path) -> None:
+    text = track(point(1) + point(2).replace("</trkpt>", "") + point(3) + point(4))
+    log = read(tmp_path, text)
+    assert log.fix_table.latitude_deg.tolist() == [35.80001, 35.80003, 35.80004]
+    begin, end = text.index(point(2).replace("</trkpt>", "")), text.index(point(3))
+    first, after = log.damage.spans
+    assert (first.offset, first.length) == (begin, end - begin)
+    assert text[after.offset :].startswith("</trkseg>")  # which fits no longer
 
 
 def check_damage(tmp_path: Path, seed: int) -> None:

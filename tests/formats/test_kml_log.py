@@ -18,7 +18,7 @@ from uavkit.core.errors import InputError
 from uavkit.core.flight_log import ExposureKind, FlightLog
 from uavkit.core.gpstime import NO_TIME, gps_time_ns_from_utc
 from uavkit.core.progress import silent
-from uavkit.formats import kml_log
+from uavkit.formats import kml_document, kml_log
 from uavkit.formats.kml import read_positions
 
 NOON_NS = gps_time_ns_from_utc(datetime(2024, 5, 6, 12, tzinfo=UTC))
@@ -143,6 +143,20 @@ def test_zip_bombs_end_soon(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"bomb\.kmz"):
             read_positions(tmp_path / "bomb.kmz")
         assert time.monotonic() - began < 20
+
+
+def test_no_more_is_unpacked_than_is_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes: list[int] = []
+
+    class Stream(io.BytesIO):
+        def read(self, size: int | None = -1, /) -> bytes:
+            sizes.append(-1 if size is None else size)
+            return super().read(size)
+
+    monkeypatch.setattr(kml_document, "_LARGEST_HELD_BYTES", 1000)
+    with pytest.raises(InputError, match="more than 1000 bytes"):
+        kml_document._bounded(tmp_path, Stream(bytes(2000)))
+    assert sizes == [1001]
 
 
 def test_entity_bombs_and_deep_nesting_are_refused(tmp_path: Path) -> None:

@@ -108,12 +108,16 @@ class _Window:
             self.more()
         return self._base + found.start()
 
-    def after_end_tag(self, offset: int) -> int:
-        """Return the offset behind the end tag at an offset; of an element without content the offset is that."""
+    def fault_at(self, offset: int) -> int:
+        """Return where a fault begins: expat tells an end tag that fits no begin by its name, behind the slash."""
         here = max(offset - self._base, 0)
-        if self._data[here : here + 2] != b"</":
-            return offset
-        return self._base + self._data.index(b">", here) + 1
+        return offset - 2 if self._data[max(here - 2, 0) : here] == b"</" else offset
+
+    def after_end(self, element: ElementTree.Element, offset: int) -> int:
+        """Return the offset behind an element: its end is told at its end tag, of one without content behind it."""
+        here = max(offset - self._base, 0)
+        bare = len(element) == 0 and not element.text and self._data[max(here - 2, 0) : here] == b"/>"
+        return offset if bare else self._base + self._data.index(b">", here) + 1
 
 
 @dataclass(slots=True)
@@ -161,7 +165,7 @@ class XmlReader:
             if not fault:
                 return
             self.fault = self.fault or fault
-            broken = run.at if run.builder is None else run.begin
+            broken = window.fault_at(run.at) if run.builder is None else run.begin
             resumed = window.search(self._marks, max(run.at, run.start + 1))
             end = window.end if resumed is None else resumed
             self._tally.add(broken, end - broken, fault)
@@ -189,7 +193,7 @@ class XmlReader:
                 if element is None:
                     self._tally.add(begin, end_tag - begin, "an element without an end")
                 else:
-                    yield XmlRecord(element, begin, window.after_end_tag(end_tag) - begin)
+                    yield XmlRecord(element, begin, window.after_end(element, end_tag) - begin)
             if fault or window.final:
                 return fault
             window.drop(run.at)
