@@ -550,3 +550,13 @@ def test_200_mb_in_two_seconds_with_little_memory(tmp_path: Path) -> None:
     kept, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 3.0 * kept
+
+
+def test_junk_and_zeros_are_passed_quickly(tmp_path: Path) -> None:
+    log = small_flight(np.random.default_rng(1), 1)
+    junk = np.random.default_rng(2).integers(0, 256, 20_000_000, dtype=np.uint8).tobytes()
+    begin = time.perf_counter()
+    result = read(tmp_path, bytes(log.data) + junk + bytes(50_000_000) + bytes(log.data))
+    assert time.perf_counter() - begin < 5.0
+    assert result.damage.lost_bytes == 70_000_000
+    assert result.message_counts["ATT"] == 50

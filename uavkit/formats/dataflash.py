@@ -61,6 +61,7 @@ _FMT_HEAD = re.compile(rb"\xa3\x95\x80[\s\S]{2}[A-Z0-9]{2,4}\0{0,2}[a-zA-Z]")
 _LEAST_HEADS = 4
 _LONGEST_MESSAGE = 255
 _PIECE = 4096
+_MOST_NOTES = 20
 _BLOCK_BYTES = 1024 * 1024
 """Small, for it is the greater part of what reading takes beside the tables."""
 
@@ -129,7 +130,7 @@ class _Scan:
         self._counts: dict[str, int] = defaultdict(int)
         self._undefined: dict[int, int] = defaultdict(int)
         self._tally, self._lost_any = DamageTally(), False
-        self._notes: list[str] = []
+        self._notes: dict[str, None] = {}
         self._size, self._zeros_from, self._end = 0, 0, 0
         self._tables = np.zeros((5, 256), dtype=np.int64)
         self._tables[0, FMT_TYPE] = FMT_LENGTH
@@ -188,7 +189,7 @@ class _Scan:
         kind = definition.type_number
         if kind == FMT_TYPE or not _can_be(definition):
             if kind != FMT_TYPE:
-                self._notes.append(f"the definition of type {kind} contradicts itself and is left out")
+                self._note(f"the definition of type {kind} contradicts itself and is left out")
             return
         old = self._now.get(kind)
         if old is None or old.length == definition.length:
@@ -214,10 +215,14 @@ class _Scan:
         after_old = frames.frame_length(block, p + old.length, self._tables[0])
         after_new = frames.frame_length(block, p + new.length, self._tables[0])
         if after_old > 0 and after_new == 0:
-            self._notes.append(f"a second definition of type {kind} ({new.name}) does not fit and is left out")
+            self._note(f"a second definition of type {kind} ({new.name}) does not fit and is left out")
             self._define(old)
         else:
             self._define(new)
+
+    def _note(self, text: str) -> None:
+        if len(self._notes) < _MOST_NOTES:
+            self._notes[text] = None
 
     def _count_type(self, kind: int) -> None:
         """Book what was counted of a type under its present name."""
@@ -245,6 +250,8 @@ class _Scan:
         self._size = offset + len(block)
         if block[-1] != 0:
             self._zeros_from = self._size
+            return
+        if not block.any():
             return
         for end in range(len(block), 0, -_PIECE):
             filled = np.flatnonzero(block[max(0, end - _PIECE) : end])

@@ -38,6 +38,8 @@ from uavkit.formats.log_bytes import Blocks, DamageTally, opened
 
 _BLOCK_BYTES = 1024 * 1024
 _LONGEST_LINE = 8192
+_MOST_TRIES = 200_000
+"""Looks for a message inside a damaged line, over a whole file: a file so damaged is not worth more time."""
 _FMT_LINE = re.compile(rb"(?m)^[ \t]*FMT[ \t]*,[ \t]*\d+[ \t]*,[ \t]*\d+[ \t]*,[ \t]*\w+[ \t]*,")
 _NAMES = re.compile(rb"(?=([A-Z][A-Z0-9]{0,3})[ \t]*,)")
 _FMT_PARTS = 6
@@ -101,6 +103,7 @@ class _Lines:
         self._tally = DamageTally()
         self._table = np.zeros((1 << 15, 5), dtype=np.int64)
         self._endless = False
+        self._tries = 0
 
     def take(self, block: NDArray[np.uint8], offset: int, final: bool) -> int:
         """Read the lines of a block; returns how much of it is done with."""
@@ -139,13 +142,25 @@ class _Lines:
         self._take_kinds(block, table, defining, why, offset)
         self._split_texts(block, table, why)
         self._take_kinds(block, table, ~defining, why, offset)
-        bad = np.flatnonzero(why != "")
-        tails = np.array([self._tail(block, table[row]) for row in bad.tolist()], dtype=np.int64).reshape(-1, 5)
-        tail_why = np.where(tails[:, marks.WHAT] == marks.BROKEN, "no message inside", "").astype("U64")
-        self._take_kinds(block, tails, np.full(len(tails), True), tail_why, offset)
-        for row, tail, lost in zip(bad.tolist(), tails, tail_why.tolist(), strict=True):
-            begin, end = int(table[row, marks.BEGIN]), int(table[row, marks.END] if lost else tail[marks.BEGIN])
-            self._tally.add(offset + begin, end - begin, str(why[row]))
+        self._take_tails(block, table[why != ""], why[why != ""], offset)
+
+    def _take_tails(self, block: NDArray[np.uint8], bad: Indices, why: NDArray[np.str_], offset: int) -> None:
+        """Read what stands whole at the end of damaged lines, and count the rest of them as lost."""
+        if len(bad) == 0:
+            return
+        tails = bad.copy()
+        tails[:, marks.WHAT] = marks.BROKEN
+        for row in range(len(bad)):
+            if self._tries > _MOST_TRIES:
+                break
+            tails[row] = self._tail(block, bad[row])
+        refused = np.where(tails[:, marks.WHAT] == marks.BROKEN, "no message inside", "").astype("U64")
+        self._take_kinds(block, tails, np.full(len(tails), True), refused, offset)
+        begin, end = bad[:, marks.BEGIN], np.where(refused == "", tails[:, marks.BEGIN], bad[:, marks.END])
+        first = np.flatnonzero(np.append(True, begin[1:] != end[:-1]))
+        last = np.append(first[1:], len(bad)) - 1
+        for a, b in zip(first.tolist(), last.tolist(), strict=True):
+            self._tally.add(offset + int(begin[a]), int(end[b] - begin[a]), str(why[a]))
 
     def _split_texts(self, block: NDArray[np.uint8], table: Indices, why: NDArray[np.str_]) -> None:
         """Refuse lines that end with a text in which another message stands: the end of the line was lost."""
@@ -179,6 +194,9 @@ class _Lines:
             return none
         out = np.zeros((1, 5), dtype=np.int64)
         for match in _NAMES.finditer(block[begin:end].tobytes(), 1):
+            self._tries += 1
+            if self._tries > _MOST_TRIES:
+                break
             marks.lines(block[:end], True, begin + match.start(), out)
             name = match.group(1).decode("ascii")
             if out[0, marks.WHAT] in (marks.PLAIN, marks.WIDE) and (name == _FMT or self._fits(name, out)[0]):

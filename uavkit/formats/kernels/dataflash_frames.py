@@ -174,6 +174,8 @@ def scan(
                 begin, why = p, refused
             state[SYNCHRONISED] = 0
             p += 1
+            while p < stop and data[p] != 0xA3:
+                p += 1
             continue
         kind = data[p + 2]
         todo = tables[3, kind]
