@@ -12,14 +12,16 @@ from uavkit.formats import tlog
 SITL = Path(__file__).resolve().parents[2] / "../shared/data/sitl"
 
 MEMORY = """
-import resource, sys
+import sys
 from pathlib import Path
 from uavkit.formats import tlog
 import dataclasses
 import numpy as np
 
 def grown():
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    # Not getrusage: its peak is that of the parent process until the child's own is greater.
+    status = Path("/proc/self/status").read_text()
+    return int(status.split("VmHWM:")[1].split()[0]) * 1024
 
 tlog.read_log(Path(sys.argv[1]))
 before = grown()
@@ -90,9 +92,11 @@ def test_fifty_megabytes(tmp_path: Path, name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["digicam.tlog", "px4_dist.tlog"])
 def test_memory_of_fifty_megabytes(tmp_path: Path, name: str) -> None:
+    if not Path("/proc/self/status").exists():
+        pytest.skip("the peak of a process is read from /proc")
     small, path = repeated(tmp_path / "small.tlog", name, 1.3), repeated(tmp_path / "long.tlog", name, 50.0)
     command = [sys.executable, "-c", MEMORY, str(small), str(path)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     grown, extracted = (int(word) for word in done.stdout.split())
     print(f"{name}: {grown / 1e6:.1f} MB more for {extracted / 1e6:.1f} MB of tables")  # noqa: T201
-    assert grown < 3 * extracted
+    assert 0.3 * extracted < grown < 3 * extracted
