@@ -16,6 +16,7 @@ from damage:
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,21 +82,25 @@ def read_log(path: Path, progress: Progress = silent) -> FlightLog:
     notes = list[str]()
     system, component = _vehicle(raw, notes)
     rows = {number: _of_vehicle(number, part, system, component) for number, part in raw.rows.items()}
+    raw = replace(raw, rows={})  # so that what is done with can be given back: logs are long
     vehicle = vehicle_time(rows)
     pilot = Pilot(autopilot=_autopilot(rows[HEARTBEAT], component), parameters=_parameters(rows, component))
     texts = _texts(rows[STATUSTEXT])
+    name = _vehicle_name(rows, component, texts)
     exposure_table = exposures(rows, vehicle, pilot, notes)
+    notes += _time_notes(raw.stamped, rows, vehicle)
+    attitude_table = attitudes(rows.pop(ATTITUDE), vehicle)
+    estimate_table = estimates(rows.pop(GLOBAL_POSITION_INT), vehicle)
     fix_table = fixes(rows, vehicle)
-    notes += _time_notes(raw, rows, vehicle)
     notes += _height_notes(fix_table)
     longest = vehicle.longest
     return FlightLog(
         source=str(path),
         kind=LogKind.TLOG,
-        vehicle=_vehicle_name(rows, component, texts),
+        vehicle=name,
         fix_table=fix_table,
-        estimate_table=estimates(rows[GLOBAL_POSITION_INT], vehicle),
-        attitude_table=attitudes(rows[ATTITUDE], vehicle),
+        estimate_table=estimate_table,
+        attitude_table=attitude_table,
         exposure_table=exposure_table,
         clock=longest.clock if longest is not None else None,
         message_counts=raw.message_counts,
@@ -219,9 +224,9 @@ def _height_notes(fixes: FixTable) -> list[str]:
     return []
 
 
-def _time_notes(raw: RawLog, rows: Mapping[int, Rows], vehicle: VehicleTime) -> list[str]:
+def _time_notes(stamped: bool, rows: Mapping[int, Rows], vehicle: VehicleTime) -> list[str]:
     notes = list[str]()
-    if not raw.stamped:
+    if not stamped:
         notes.append("a raw stream without times of reception")
     sessions = vehicle.sessions
     if len(sessions) > 1:

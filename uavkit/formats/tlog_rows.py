@@ -30,7 +30,7 @@ from uavkit.formats.kernels.mavlink_frames import (
 from uavkit.formats.log_bytes import Blocks, DamageTally, opened
 from uavkit.formats.mavlink_messages import FIELDS, dialect, payload_type, record_type
 
-_BLOCK_BYTES = 512 * 1024
+_BLOCK_BYTES = 256 * 1024
 _HEAD_BYTES = 256 * 1024
 """Looked at to see whether stamps stand before the frames."""
 _WHY = {
@@ -66,7 +66,9 @@ class Rows:
         return len(self.fields)
 
     def where(self, rows: "Flags | Indices") -> "Rows":
-        """Return the rows that a mask or indexes choose."""
+        """Return the rows that a mask or indexes choose; these themselves where a mask chooses all."""
+        if rows.dtype == np.bool_ and rows.all():
+            return self
         return Rows(
             fields=self.fields[rows],
             host_ns=self.host_ns[rows],
@@ -227,6 +229,8 @@ def without_stray_stamps(rows: Rows) -> Rows:
     all_known = known[:-2] & known[1:-1] & known[2:]
     far = (_apart(here, before, all_known) > _JUMP_NS) & (_apart(here, after, all_known) > _JUMP_NS)
     stray = far & (_apart(before, after, all_known) < _JUMP_NS)
+    if not stray.any():
+        return rows
     cleaned = host.copy()
     cleaned[1:-1][stray] = NO_TIME
     return Rows(fields=rows.fields, host_ns=cleaned, offset=rows.offset, system=rows.system, component=rows.component)
