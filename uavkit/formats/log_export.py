@@ -181,38 +181,52 @@ def _by_mode(table: FixTable | ExposureTable) -> list[tuple[str, NDArray[np.int6
     return [mode for mode in modes if len(mode[1])]
 
 
-def _coordinates(
-    table: FixTable | ExposureTable, rows: NDArray[np.int64], height_m: Array
-) -> list[tuple[float, float, float]]:
-    columns = (table.longitude_deg[rows], table.latitude_deg[rows], height_m[rows])
-    return list(zip(*(column.tolist() for column in columns), strict=True))
-
-
 def _write_kml(log: FlightLog, path: Path) -> None:
-    import simplekml
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as stream:
+        stream.write(_KML_HEAD.format(escape(xml_text(Path(log.source).name))))
+        for mode, rows, height_m in _by_mode(log.fix_table):
+            stream.writelines(_kml_track(log.fix_table, mode, rows, height_m))
+        for mode, rows, height_m in _by_mode(log.exposure_table):
+            stream.writelines(_kml_points(log.exposure_table, mode, rows, height_m))
+        stream.write("</Document>\n</kml>\n")
 
-    simplekml.Kml.resetidcounter()  # the same content gives the same file
-    document = simplekml.Kml(name=xml_text(Path(log.source).name))
-    table = log.fix_table
-    utc = utc_texts(table.when.gps_ns, "us")
-    for mode, rows, height_m in _by_mode(table):
-        timed = table.when.gps_ns[rows] != NO_TIME
-        if np.any(timed):
-            track = document.newgxtrack(name="track", altitudemode=mode)
-            track.newwhen([utc[row] for row in rows[timed]])
-            track.newgxcoord(_coordinates(table, rows[timed], height_m))
-        if not np.all(timed):
-            coordinates = _coordinates(table, rows[~timed], height_m)
-            document.newlinestring(name="positions without time", coords=coordinates, altitudemode=mode)
-    exposures = log.exposure_table
-    utc = utc_texts(exposures.when.gps_ns, "us")
-    for mode, rows, height_m in _by_mode(exposures):
-        for row, place in zip(rows.tolist(), _coordinates(exposures, rows, height_m), strict=True):
-            point = document.newpoint(name=xml_text(_label(exposures, row)), coords=[place], altitudemode=mode)
-            if utc[row]:
-                point.timestamp.when = utc[row]
-    with atomic_path(path) as temporary:
-        temporary.write_text(document.kml(), encoding="utf-8")
+
+_KML_HEAD = """<?xml version="1.0" encoding="UTF-8"?>
+<kml xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2">
+<Document><name>{}</name>
+"""
+
+
+def _kml_track(table: FixTable, mode: str, rows: NDArray[np.int64], height_m: Array) -> Iterator[str]:
+    """Yield a track of the positions with times, and a line of those without."""
+    when = table.when.gps_ns[rows]
+    timed, untimed = rows[when != NO_TIME], rows[when == NO_TIME]
+    altitude = f"<altitudeMode>{mode}</altitudeMode>"
+    if len(timed):
+        yield f"<Placemark><name>track</name><gx:Track>{altitude}\n"
+        yield from (f"<when>{utc}</when>\n" for utc in utc_texts(table.when.gps_ns[timed], "us"))
+        yield from (f"<gx:coord>{text}</gx:coord>\n" for text in _coordinates(table, timed, height_m, " "))
+        yield "</gx:Track></Placemark>\n"
+    if len(untimed):
+        yield f"<Placemark><name>positions without time</name><LineString>{altitude}<coordinates>\n"
+        yield from (f"{text}\n" for text in _coordinates(table, untimed, height_m, ","))
+        yield "</coordinates></LineString></Placemark>\n"
+
+
+def _kml_points(table: ExposureTable, mode: str, rows: NDArray[np.int64], height_m: Array) -> Iterator[str]:
+    coordinates = _coordinates(table, rows, height_m, ",")
+    for row, utc, text in zip(rows.tolist(), utc_texts(table.when.gps_ns[rows], "us"), coordinates, strict=True):
+        stamp = f"<TimeStamp><when>{utc}</when></TimeStamp>" if utc else ""
+        place = f"<Point><altitudeMode>{mode}</altitudeMode><coordinates>{text}</coordinates></Point>"
+        yield f"<Placemark><name>{escape(xml_text(_label(table, row)))}</name>{stamp}{place}</Placemark>\n"
+
+
+def _coordinates(
+    table: FixTable | ExposureTable, rows: NDArray[np.int64], height_m: Array, separator: str
+) -> Iterator[str]:
+    columns = (table.longitude_deg[rows], table.latitude_deg[rows], height_m[rows])
+    for longitude, latitude, height in zip(*(column.tolist() for column in columns), strict=True):
+        yield f"{longitude!r}{separator}{latitude!r}{separator}{height:.4f}"
 
 
 def _label(table: ExposureTable, row: int) -> str:
