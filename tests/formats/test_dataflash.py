@@ -151,6 +151,20 @@ def test_a_late_contact_is_of_its_own_command_and_a_contact_alone_is_an_exposure
     assert kinds == [ExposureKind.FEEDBACK, ExposureKind.TRIGGER, ExposureKind.FEEDBACK, ExposureKind.FEEDBACK]
 
 
+def test_a_confirmed_command_shows_a_pin_where_the_parameters_are_lost(tmp_path: Path) -> None:
+    log = MadeLog().define_all()
+    log.cam("TRIG", BOOT_US, 0)
+    log.cam("CAM", BOOT_US + 800, 0)
+    assert read(tmp_path, log).exposure_table.kind.tolist() == [ExposureKind.FEEDBACK]
+
+
+def test_the_pin_by_its_name_in_older_firmware(tmp_path: Path) -> None:
+    log = MadeLog().define_all()
+    log.add("PARM", BOOT_US, b"CAM_FEEDBACK_PIN", 50.0, 0.0)
+    log.cam("CAM", BOOT_US, 0)
+    assert read(tmp_path, log).exposure_table.kind.tolist() == [ExposureKind.FEEDBACK]
+
+
 @pytest.mark.parametrize("pin", [-1.0, 0.0])
 def test_without_a_pin_an_exposure_is_a_command(tmp_path: Path, pin: float) -> None:
     log = with_pin(pin)

@@ -73,7 +73,7 @@ def number(data: Bytes, a: int, b: int) -> tuple[bool, float]:
         a += 1
     if b - a in (3, 4) and is_word(data, b - 3, (110, 97, 110)):
         return True, np.nan
-    if b - a == 3 and is_word(data, a, (105, 110, 102)):
+    if b - a in (3, 8) and is_word(data, a, (105, 110, 102)):
         return True, sign * np.inf
     q, mantissa, scale = digits(data, a, b)
     if q < 0:
