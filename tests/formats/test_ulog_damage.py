@@ -60,14 +60,16 @@ def places(message: Message, harm: Damaged) -> list[int]:
 
 
 def undefined(all_messages: list[Message], harm: Damaged) -> set[int]:
-    """Return the numbers of topics whose format and subscription are both damaged: nothing says their size."""
+    """Return the numbers of topics of which nothing says the size any more.
+
+    Those whose format and subscription are both damaged; and with them those without a format, because what follows
+    their messages is not known either.
+    """
     touched = [message for message in all_messages if not places(message, harm)]
     formats = {message.body.split(b":")[0] for message in touched if message.letter == "F"}
-    return {
-        int.from_bytes(message.body[1:3], "little")
-        for message in touched
-        if message.letter == "A" and message.body[3:] in formats
-    }
+    named = [message for message in all_messages if message.letter == "A" and message.body[3:] in formats]
+    lost = any(not places(message, harm) for message in named)
+    return {int.from_bytes(message.body[1:3], "little") for message in named} if lost else set()
 
 
 def check_damage(data: bytes, all_messages: list[Message], rng: np.random.Generator) -> str:

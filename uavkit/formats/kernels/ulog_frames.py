@@ -257,7 +257,7 @@ def _chain_holds(data: NDArray[np.uint8], start: int, end: int, aligned: bool, t
     sure = data[start + 2] in (_D, _S)
     at, count = start, 0
     while at < end and count < PROOF:
-        length = frame_length(data, at, tables)
+        length = _any_length(data, at, tables) if count else frame_length(data, at, tables)
         if length <= 0:
             return length
         at += length
@@ -268,8 +268,7 @@ def _chain_holds(data: NDArray[np.uint8], start: int, end: int, aligned: bool, t
         return 0
     if count >= 2 or sure or at == len(data):
         return 1
-    after = frame_length(data, at, tables)
-    return min(after, 1)
+    return min(_any_length(data, at, tables), 1)
 
 
 @kernel
@@ -309,7 +308,7 @@ def _judged(data: NDArray[np.uint8], final: bool, synced: bool, place: int, tabl
         after = _any_length(data, end, tables)
         if after == MORE and not final:
             return MORE, 0, False
-        follows = after > 0 or (after == MORE and synced and not orphan)
+        follows = after > 0
     sure = not orphan and data[place + 2] in (_D, _S, _B, _HEADER_TYPE)
     if not follows and (orphan or not (synced or sure)):
         return 0, 1, False
