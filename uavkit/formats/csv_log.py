@@ -287,15 +287,17 @@ def _with_week(times: dict[str, float | None]) -> dict[str, float | None]:
     return times
 
 
+_MEMBERS = {
+    name: {text: int(member) for member in members for text in (member.name.lower(), str(int(member)))}
+    for name, members in NAMES.items()
+}
+_LARGEST = {"satellites": 255, "receiver": 255}
+
+
 def _code(name: str, text: str) -> int:
-    if name in NAMES:
-        members = {member.name.lower(): int(member) for member in NAMES[name]}
-        code = members.get(text, int(text) if text in {str(value) for value in members.values()} else -1)
-        largest = 255
-    else:
-        code = int(text) if re.fullmatch(r"[0-9]{1,18}", text) else -1
-        largest = 255 if name in ("satellites", "receiver") else 2**62
-    if not 0 <= code <= largest:
+    whole = int(text) if re.fullmatch(r"[0-9]{1,18}", text) else -1
+    code = _MEMBERS[name].get(text, -1) if name in _MEMBERS else whole
+    if not 0 <= code <= _LARGEST.get(name, 2**62):
         raise _FaultError(f"{name} is {text[:30]!r}: no such value")
     return code
 

@@ -80,6 +80,8 @@ def head_text(head: bytes) -> str:
 
 def number(text: str) -> float:
     """Return a decimal number, NaN for anything else (also for inf, hexadecimal, underscores, decimal commas)."""
+    if not text:
+        return math.nan
     text = text.strip()
     value = float(text) if _NUMBER.fullmatch(text) else math.nan
     return value if math.isfinite(value) else math.nan
