@@ -62,7 +62,7 @@ _LEAST_HEADS = 4
 _LONGEST_MESSAGE = 255
 _PIECE = 4096
 _MOST_NOTES = 20
-_BLOCK_BYTES = 1024 * 1024
+_BLOCK_BYTES = 256 * 1024
 """Small, for it is the greater part of what reading takes beside the tables."""
 
 

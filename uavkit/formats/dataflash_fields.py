@@ -163,7 +163,7 @@ NO_ROWS = Rows(places=np.zeros(0, dtype=np.int64), columns={})
 class Messages:
     """What a dataflash log holds, before it is turned into tables."""
 
-    rows: Mapping[str, Rows]
+    rows: dict[str, Rows]
     """Of the wanted names that are in the log."""
     counts: Mapping[str, int]
     """Intact messages by name."""
@@ -173,6 +173,10 @@ class Messages:
     def of(self, name: str) -> Rows:
         """Return the messages of a name, none where there are none."""
         return self.rows.get(name, NO_ROWS)
+
+    def take(self, name: str) -> Rows:
+        """Return the messages of a name and keep them no longer: logs are large."""
+        return self.rows.pop(name, NO_ROWS)
 
 
 def text_of(raw: bytes) -> str:

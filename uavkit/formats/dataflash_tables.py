@@ -56,7 +56,10 @@ _RECEIVERS = {"GPS": (0, "GPA"), "GPS2": (1, "GPA2"), "GPSB": (2, "GPAB")}
 
 
 def flight_log(messages: Messages, source: str, kind: LogKind) -> FlightLog:
-    """Return the tables of a log; those of kinds that it does not hold are empty, and the notes say so."""
+    """Return the tables of a log; those of kinds that it does not hold are empty, and the notes say so.
+
+    The messages are taken out of ``messages``, so that not all of them are held beside the tables.
+    """
     with np.errstate(all="ignore"):  # nothing tells a damaged number from an intact one: infinity among others
         return _flight_log(messages, source, kind)
 
@@ -66,20 +69,21 @@ def _flight_log(messages: Messages, source: str, kind: LogKind) -> FlightLog:
     gps = _receivers(messages)
     fixes, gps_boot_ns = _fixes(gps, notes)
     clock = fit_clock(gps_boot_ns, fixes.when.gps_ns)
-    fixes = _with_believable_times(fixes, clock, notes)
-    parameters = _parameters(messages.of("PARM"))
-    exposures = _exposures(messages, gps, parameters, notes)
-    texts = tuple(text for text in messages.of("MSG").texts("Message") if text)
+    fixes = with_gps_times(_with_believable_times(fixes, clock, notes), clock)
+    parameters = _parameters(messages.take("PARM"))
+    exposures = with_gps_times(_exposures(messages, gps, parameters, notes), clock)
+    del gps
+    texts = tuple(text for text in messages.take("MSG").texts("Message") if text)
     if clock is None:
         notes.append("no fix with a time is in the log: times are those of the boot clock only")
     return FlightLog(
         source=source,
         kind=kind,
         vehicle=next((text for text in texts if VEHICLE.match(text)), ""),
-        fix_table=with_gps_times(fixes, clock),
-        estimate_table=with_gps_times(_estimates(messages.of("POS")), clock),
-        attitude_table=with_gps_times(_attitudes(messages.of("ATT")), clock),
-        exposure_table=with_gps_times(exposures, clock),
+        fix_table=fixes,
+        estimate_table=with_gps_times(_estimates(messages.take("POS")), clock),
+        attitude_table=with_gps_times(_attitudes(messages.take("ATT")), clock),
+        exposure_table=exposures,
         clock=clock,
         message_counts=messages.counts,
         parameters=parameters,
@@ -105,9 +109,9 @@ def _receivers(messages: Messages) -> Rows:
     """Return the GPS messages of all receivers with what GPA says of each: columns ``receiver`` and GPA's."""
     parts = []
     for name, (number, accuracy) in _RECEIVERS.items():
-        rows = messages.of(name)
+        rows = messages.take(name)
         if len(rows):
-            extra = _accuracies(rows, messages.of(accuracy))
+            extra = _accuracies(rows, messages.take(accuracy))
             extra["receiver"] = rows.integer("I", number)
             boot_ns = boot_ns_of(rows, "T")
             parts.append(Rows(places=rows.places, columns={**rows.columns, **extra, "boot_ns": boot_ns}))
@@ -232,7 +236,7 @@ def _parameters(parm: Rows) -> dict[str, float]:
 
 def _exposures(messages: Messages, gps: Rows, parameters: dict[str, float], notes: list[str]) -> ExposureTable:
     """Return the exposures of the first camera: CAM, and TRIG where no CAM confirms it."""
-    cam, trig, instance = _first_camera(messages.of("CAM"), messages.of("TRIG"), notes)
+    cam, trig, instance = _first_camera(messages.take("CAM"), messages.take("TRIG"), notes)
     if len(cam) + len(trig) == 0:
         return no_exposures()
     timed = _timed_rows(messages, gps)
