@@ -96,6 +96,12 @@ def test_track_with_times_and_angles(tmp_path: Path) -> None:
     assert log.exposure_table.name == ("A",)
 
 
+def test_a_time_without_a_zone_is_none(tmp_path: Path) -> None:
+    for text in ("2024-05-06T12:00:01", "2024-05-06", "2024", "soon", "6024-05-06T12:00:01Z"):
+        log = read(tmp_path, kml(point("A", "1,2,3", more=f"<TimeStamp><when>{text}</when></TimeStamp>")))
+        assert log.exposure_table.when.gps_ns.tolist() == [NO_TIME]
+
+
 def test_a_track_whose_times_do_not_fit_has_none(tmp_path: Path) -> None:
     track = "<when>2024-05-06T12:00:00Z</when><gx:coord>139 35 100</gx:coord><gx:coord>139.1 35.1 101</gx:coord>"
     log = read(tmp_path, kml(f"<Placemark><gx:Track>{track}</gx:Track></Placemark>"))

@@ -1,6 +1,7 @@
 """Flight logs written for other programs."""
 
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -171,6 +172,20 @@ def test_parquet_without_pyarrow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     with pytest.raises(InputError, match=r"pip install 'uavkit\[parquet\]'"):
         export_log(made_log(0), tmp_path, ExportKind.PARQUET)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_logs_are_read_at_once(tmp_path: Path) -> None:
+    readers = {"gpx": gpx.read_log, "kml": kml_log.read_log, "csv": csv_log.read_log}
+    files = [
+        file
+        for seed, kind in enumerate((ExportKind.GPX, ExportKind.KML, ExportKind.CSV) * 3)
+        for file in export_log(made_log(seed), tmp_path / f"{seed}.{kind.value}", kind)
+    ]
+    alone = [readers[file.suffix[1:]](file, silent) for file in files]
+    with ThreadPoolExecutor(8) as pool:
+        together = list(pool.map(lambda file: readers[file.suffix[1:]](file, silent), files))
+    for one, other in zip(alone, together, strict=True):
+        same_tables(one, other)
 
 
 def test_nothing_to_write_is_an_error(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC
 from pathlib import Path
 
 import numpy as np
@@ -237,7 +238,7 @@ class _Rows:
         for name, text in texts.items():
             if text.lower() in _UNKNOWN:
                 continue
-            value = gps_time_of(text) if name == "utc" else nanoseconds(text, _SCALES.get(name, 9))
+            value = gps_time_of(text, UTC) if name == "utc" else nanoseconds(text, _SCALES.get(name, 9))
             if value is None:
                 raise _FaultError(f"{name} is {text[:40]!r}: no such time")
             times[_TARGETS[name]] = value

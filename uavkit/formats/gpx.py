@@ -9,6 +9,7 @@ https://www.topografix.com/GPX/1/1/
 """
 
 import math
+from datetime import UTC
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -94,7 +95,7 @@ def _take(point: ElementTree.Element, points: _Points) -> str | None:
         course=number(texts.get("course", "")),
         fix=_FIX_TYPES.get(texts.get("fix", "").lower(), FixType.UNKNOWN),
         satellites=satellites if 0 <= satellites < 255 else 255.0,
-        gps_ns=gps_time_of(texts.get("time", "")),
+        gps_ns=gps_time_of(texts.get("time", ""), UTC),
     )
     points.names.append(texts.get("name", "")[:200])
     return None

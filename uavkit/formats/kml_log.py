@@ -8,7 +8,7 @@
 * Heights: ``absolute`` counts from the EGM96 geoid. ``relativeToGround`` counts from the terrain by the standard, but
   programs for drones write heights above the take-off point so: it becomes the height above home, with a note; on level
   ground both are the same. An altitude clamped to the ground says nothing.
-* Times without a zone are UTC, a date alone is no time.
+* A time without a zone, or a date alone, is no time.
 
 https://developers.google.com/kml/documentation/kmlreference
 """
@@ -150,7 +150,7 @@ def _count(found: _Found) -> int:
 def _take_point(mark: ElementTree.Element, point: ElementTree.Element, found: _Found) -> None:
     tuples = list(_tuples(child_text(point, "coordinates")))
     stamp = next((child for child in mark if local_name(child) == "TimeStamp"), None)
-    gps_ns = gps_time_of(child_text(stamp, "when")) if stamp is not None else None
+    gps_ns = gps_time_of(child_text(stamp, "when"), None) if stamp is not None else None
     if len(tuples) != 1 or not _add(found.points, tuples[0], _mode(point), gps_ns):
         found.no_place += 1
         return
@@ -169,7 +169,7 @@ def _take_line(line: ElementTree.Element, found: _Found) -> None:
 def _take_track(track: ElementTree.Element, found: _Found) -> None:
     """Add a track's positions and attitudes; what belongs together has the same place in the order of its kind."""
     parts = {name: [child.text or "" for child in track if local_name(child) == name] for name in _TRACK}
-    times = [gps_time_of(text) for text in parts["when"]]
+    times = [gps_time_of(text, None) for text in parts["when"]]
     count, mode = len(parts["coord"]), _mode(track)
     if len(times) != count:
         found.notes.append(f"a track has {len(times)} times for {count} positions: its times are left out")

@@ -5,7 +5,7 @@ import re
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from typing import BinaryIO, Protocol, TypeVar
 
@@ -101,16 +101,18 @@ def nanoseconds(text: str, digits: int = 9) -> int | None:
     return -value if found[1] == "-" else value
 
 
-def gps_time_of(text: str) -> int | None:
-    """Return the GPS time of an ISO 8601 instant, UTC where it names no zone; None for a date alone, or nonsense."""
+def gps_time_of(text: str, zone: tzinfo | None) -> int | None:
+    """Return the GPS time of an ISO 8601 instant, in ``zone`` where it names none; None for what is no instant.
+
+    That is a date alone, a time of no zone where ``zone`` is None, and nonsense.
+    """
     text = text.strip()
     if len(text) < 16:
         return None
     try:
         moment = datetime.fromisoformat(text)
-        if moment.year > _LAST_YEAR:
-            return None
-        return gps_time_ns_from_utc((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).astimezone(UTC))
+        moment = moment if moment.tzinfo else moment.replace(tzinfo=zone)
+        return gps_time_ns_from_utc(moment.astimezone(UTC)) if moment.tzinfo and moment.year <= _LAST_YEAR else None
     except (ValueError, OverflowError):
         return None
 
