@@ -12,10 +12,12 @@ are no checksums. The rule by which messages are told from damage:
 3. What nothing known follows is accepted (the damage is behind it), unless its time is more than a minute away from
    that of the message before, or a sure message begins inside it: then it was cut short.
 
-So what damage did not touch is found. What it touched counts as lost, except where head and length stand and nothing
-tells: a payload with a flipped bit is taken as it stands. Bytes that belong to no accepted message are lost bytes, all
-of them: messages of types that nothing defines (an FMT is good for what stands before it too), and zeros at the end of
-a file whose space was set aside, which the notes name, for they are no damage.
+So what damage did not touch is found; one case is left: a single message without a time, as firmware of 2013 has many,
+that by chance ends where the one cut short before it would have. What damage touched counts as lost, except where head
+and length stand and nothing tells: a payload with a flipped bit is taken as it stands. Bytes that belong to no accepted
+message are lost bytes, all of them: those of types that nothing defines (an FMT is good for what stands before it too),
+and zeros at the end of a file whose space was set aside, which the notes name, for they are no damage. A log that was
+downloaded while it grew is a prefix of the whole one: its last message is cut short, and that is all.
 
 Sources: ArduPilot, libraries/AP_Logger/LogStructure.h (heads, FMT, format characters).
 """
@@ -206,7 +208,10 @@ class _Scan:
         self.first.setdefault(kind, definition)
         self._tables[0, kind] = definition.length
         self._tables[1, kind] = _clock_of(definition)
-        self._tables[3, kind] = frames.GATHER if definition.name in self._names and definition.agrees else frames.COUNT
+        wanted = definition.name in self._names
+        self._tables[3, kind] = frames.GATHER if wanted and definition.agrees else frames.COUNT
+        if wanted and not definition.agrees:
+            self._note(f"{definition.name} has columns of a kind that is not known: counted, not decoded")
 
     def _decide(self, block: NDArray[np.uint8], p: int) -> None:
         """Choose between two definitions of the type at ``p`` by which of them leads to the head of a message."""
