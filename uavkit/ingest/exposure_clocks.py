@@ -1,0 +1,217 @@
+"""Which settings of the camera's clock are worth weighing: those that many pairs agree in, made as good as they can be.
+
+Offsets come from the differences of all stills and events: coarse windows that hold many, then, within these, fine
+offsets and drifts that most stills fit. Each is improved by least squares over the pairs that are probable at it, and
+where stamps are cut down by searching the sum over all alignments itself.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from uavkit.core.arrays import Array, Indices
+from uavkit.ingest.exposure_chain import Chain
+from uavkit.ingest.exposure_sums import Clock, Pairs, log_sum, pairs_of
+
+MOST_WINDOWS = 400
+MOST_STARTS = 250
+FEWER_SHARE = 0.25
+"""Windows that hold so many fewer pairs than the best are not looked at."""
+FEWER_AT_LEAST = 10.0
+MOST_DRIFTS = 41
+NEAR_BEST = 20.0
+"""Settings whose logarithm is so much lower than the best do not count."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockLimits:
+    """What is known of the camera's clock beforehand."""
+
+    sigma_drift: float
+    """The drift is Gaussian about 0."""
+    greatest_drift: float
+    offsets_s: tuple[float, float] | None = None
+    """The offset in the middle of the events, if anything is known of it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WeighedClock:
+    """A setting of the clock and the logarithm of the sum at it."""
+
+    clock: Clock
+    log_sum: float
+
+
+def best_clocks(chain: Chain, limits: ClockLimits) -> list[WeighedClock]:
+    """Return the settings that may matter, the best first, each by least squares; none where nothing fits."""
+    blur = _vote_step(chain)
+    pairs = min(len(chain.still_s), len(chain.event_s))
+    found = _nearly_best(
+        [WeighedClock(clock=c, log_sum=log_sum(chain, c, blur)) for c in _starts(chain, limits)], 0.3 * pairs
+    )
+    for blur_s, each in ((blur, 0.2), (0.5 * blur, 0.12), (0.0, 0.08), (0.0, 0.05)):
+        found = _nearly_best([_improved(chain, entry.clock, blur_s, limits) for entry in found], each * pairs)
+        found = _without_doubles(chain, found)
+    return found
+
+
+def _nearly_best(found: list[WeighedClock], margin: float) -> list[WeighedClock]:
+    """Return the best, first, and those that may yet be as good: improvement may gain them ``margin``."""
+    order = sorted(found, key=lambda entry: -entry.log_sum)
+    return [entry for entry in order if entry.log_sum > order[0].log_sum - NEAR_BEST - margin]
+
+
+def _without_doubles(chain: Chain, found: list[WeighedClock]) -> list[WeighedClock]:
+    kept: list[WeighedClock] = []
+    for entry in found:
+        if not any(same_clock(entry.clock, other.clock, chain) for other in kept):
+            kept.append(entry)
+    return kept
+
+
+def _vote_step(chain: Chain) -> float:
+    return max(chain.noise_s, 0.12 * 2.0 * chain.typical_half_s)
+
+
+def _middle(chain: Chain) -> float:
+    return 0.5 * float(chain.event_s[0] + chain.event_s[-1])
+
+
+def _half_span(chain: Chain) -> float:
+    spans = (chain.event_s[-1] - chain.event_s[0], chain.still_s[-1] - chain.still_s[0])
+    return max(0.5 * float(min(spans)), 1.0)
+
+
+def _drifts(half_span: float, step_s: float, limits: ClockLimits) -> Array:
+    """Return drifts a step apart at the ends of the sequence, 0 among them."""
+    half = min(int(np.ceil(limits.greatest_drift * half_span / step_s - 0.5)), MOST_DRIFTS // 2)
+    return np.asarray(np.arange(-half, half + 1) * (limits.greatest_drift / max(half, 1)), dtype=np.float64)
+
+
+def _starts(chain: Chain, limits: ClockLimits) -> Iterator[Clock]:
+    """Yield offsets and drifts at which many stills fit an event, at most ``MOST_STARTS``, the fullest first."""
+    step = _vote_step(chain)
+    noise = 2.5 * chain.noise_s + step
+    drifts = _drifts(_half_span(chain), 2.0 * step, limits)
+    found: list[tuple[int, float, float]] = []
+    for low, high in _windows(chain, limits):
+        found += _peaks(chain, (low, high), drifts, (step, noise))
+    found.sort(key=lambda entry: -entry[0])
+    for _, offset, drift in found[:MOST_STARTS]:
+        yield Clock(offset_s=offset, drift=drift, reference_s=_middle(chain))
+
+
+def _windows(chain: Chain, limits: ClockLimits) -> list[tuple[float, float]]:
+    """Return spans of offsets that many differences of stills and events lie in, the fullest first."""
+    from uavkit.ingest.kernels.votes import count_differences
+
+    width = float(np.clip(0.5 * chain.interval_s, 6.0 * _vote_step(chain), 2.0))
+    middle = _middle(chain)
+    low = float(chain.still_s[0] - chain.event_s[-1]) - width
+    high = float(chain.still_s[-1] - chain.event_s[0]) + width
+    if limits.offsets_s is not None:
+        low, high = max(low, limits.offsets_s[0]), min(high, limits.offsets_s[1])
+        if low > high:
+            return []
+    count = int((high - low) / width) + 2
+    best = np.zeros(count, dtype=np.int64)
+    half_span = max(0.5 * float(chain.event_s[-1] - chain.event_s[0]), 1.0)
+    for drift in _drifts(min(half_span, 2.0 * _half_span(chain)), width, limits):
+        cells = np.zeros(count, dtype=np.int64)
+        count_differences(chain.still_s, chain.event_s + drift * (chain.event_s - middle), low, width, cells)
+        best = np.maximum(best, cells + np.maximum(np.append(cells[1:], 0), np.insert(cells[:-1], 0, 0)))
+    order = np.argsort(-best, kind="stable")[:MOST_WINDOWS]
+    least = best[order[0]] - max(FEWER_AT_LEAST, FEWER_SHARE * float(best[order[0]]))
+    chosen = order[best[order] >= max(least, 1.0)]
+    return [(low + width * float(k), low + width * float(k + 1)) for k in chosen]
+
+
+def _peaks(
+    chain: Chain, window: tuple[float, float], drifts: Array, cell: tuple[float, float]
+) -> list[tuple[int, float, float]]:
+    """Return count, offset and drift where most stills fit, for stretches of the window apart."""
+    from uavkit.ingest.kernels.votes import count_fits
+
+    step, noise = cell
+    count = max(1, int(np.ceil((window[1] - window[0]) / step)))
+    middle = _middle(chain)
+    votes = np.zeros((len(drifts), count), dtype=np.int64)
+    for row, drift in enumerate(drifts):
+        moved = chain.event_s + drift * (chain.event_s - middle)
+        count_fits(chain.still_s, chain.half_s, moved, (window[0], step, noise), votes[row])
+    best = votes.max(axis=0)
+    apart = max(2, int(np.ceil(0.34 * chain.interval_s / step)))
+    peaks = []
+    for begin in range(0, count, apart):
+        level = int(best[begin : begin + apart].max())
+        offsets = begin + np.flatnonzero(best[begin : begin + apart] == level)
+        offset = int(offsets[len(offsets) // 2])
+        rows = np.flatnonzero(votes[:, offset] == level)
+        row = int(rows[np.argmin(np.abs(rows - np.mean(rows)))])
+        if level > 0:
+            peaks.append((level, window[0] + step * offset, float(drifts[row])))
+    return peaks
+
+
+def same_clock(one: Clock, two: Clock, chain: Chain) -> bool:
+    """Tell whether two settings differ by less than what matters."""
+    noise = chain.noise_s
+    there = two.about(one.reference_s)
+    span = (one.drift - there.drift) * _half_span(chain)
+    return abs(one.offset_s - there.offset_s) < 0.3 * noise and abs(span) < 0.3 * noise
+
+
+def _improved(chain: Chain, clock: Clock, blur_s: float, limits: ClockLimits) -> WeighedClock:
+    """Return the clock by least squares over the pairs that are probable at it, weighed with half the blur."""
+    pairs = pairs_of(chain, clock, blur_s)
+    if len(pairs.still):
+        clock = fitted(chain, pairs, limits)
+    return WeighedClock(clock=clock, log_sum=log_sum(chain, clock, 0.5 * blur_s))
+
+
+def fitted(chain: Chain, pairs: Pairs, limits: ClockLimits) -> Clock:
+    """Return the clock by least squares over the pairs, weighed by their probability."""
+    return fitted_with_covariance(chain, (pairs.still, pairs.event, pairs.probability), limits)[0]
+
+
+def fitted_with_covariance(
+    chain: Chain, pairs: tuple[Indices, Indices, Array], limits: ClockLimits
+) -> tuple[Clock, Array]:
+    """Return the clock and the covariance (2, 2) of offset (s) and drift; ``pairs`` are rows and probabilities (k,)."""
+    still, event, probability = pairs
+    variance = chain.sigma_s[event] ** 2 + chain.half_s[still] ** 2 / 3.0
+    weight = probability / variance
+    reference = float(np.average(chain.event_s[event], weights=weight))
+    x = chain.event_s[event] - reference
+    y = chain.still_s[still] - chain.event_s[event]
+    offset = float(np.average(y, weights=weight))
+    information = float(weight @ x**2) + 1.0 / limits.sigma_drift**2
+    drift = float(np.clip(weight @ (x * (y - offset)) / information, -limits.greatest_drift, limits.greatest_drift))
+    covariance = np.diag([1.0 / float(weight.sum()), 1.0 / information])
+    return Clock(offset_s=offset, drift=drift, reference_s=reference), covariance
+
+
+def searched(chain: Chain, start: WeighedClock, limits: ClockLimits) -> WeighedClock:
+    """Return the best setting near a start by trying steps of offset and drift, halved where none is better.
+
+    For coarse stamps: least squares is far from the best there.
+    """
+    best = WeighedClock(clock=start.clock, log_sum=log_sum(chain, start.clock, 0.0))
+    step = 0.25 * chain.typical_half_s
+    arm = 0.6 * _half_span(chain)
+    while step > 0.4 * chain.noise_s:
+        tried = (
+            best.clock.moved(a * step, b * step / arm) for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1))
+        )
+        weighed = [
+            WeighedClock(clock=clock, log_sum=log_sum(chain, clock, 0.0))
+            for clock in tried
+            if abs(clock.drift) <= limits.greatest_drift
+        ]
+        better = max(weighed, key=lambda entry: entry.log_sum, default=best)
+        if better.log_sum > best.log_sum + 0.1:
+            best = better
+        else:
+            step *= 0.5
+    return best

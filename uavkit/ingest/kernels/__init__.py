@@ -1,0 +1,1 @@
+"""Inner loops of matching stills with exposures, on bare arrays."""
