@@ -328,7 +328,7 @@ def test_two_logs_in_one_file(tmp_path: Path) -> None:
     assert told.damage.lost_bytes == 0
     assert len(told.attitude_table) == 50
     assert told.message_counts["vehicle_attitude"] == 50
-    assert any("another header" in note for note in told.notes)
+    assert any("another log" in note for note in told.notes)
 
 
 def test_flags_that_are_not_known_are_told(tmp_path: Path) -> None:
@@ -498,3 +498,13 @@ def test_nothing_is_printed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -
     path.write_bytes(flight()[:-30] + struct.pack("<HB", 40, ord("D")) + bytes(90))
     read_log(path, silent)
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("path", LOGS, ids=lambda path: path.stem)
+def test_recorded_logs_are_recognised_without_their_beginning(path: Path) -> None:
+    if not path.exists():
+        pytest.skip("no ../shared/data")
+    with path.open("rb") as file:
+        data = file.read(200_000)
+    for gone in (0, 5, 16, 1000, 5000, 20_000):
+        assert recognises(data[gone : gone + 65536])

@@ -93,7 +93,7 @@ def check_damage(data: bytes, all_messages: list[Message], rng: np.random.Genera
             else:
                 assert listing.found.get(place) == end - place, (harm.kind, message.begin, message.letter)
     if not skip and harm.kind != "repeated":
-        assert damage.lost_bytes <= len(harm.data) - 16 * (harm.data[:7] == data[:7]) - intact_bytes
+        assert damage.lost_bytes <= len(harm.data) - 16 * (harm.data[:16] == data[:16]) - intact_bytes
     return harm.kind
 
 

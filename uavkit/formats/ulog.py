@@ -79,11 +79,15 @@ WANTED: Mapping[str, tuple[str, ...]] = {
 }  # fmt: skip
 """Topics and fields that are read; a log has those of its own time."""
 LEAST_DEFINITIONS = 3
+_WORDS = (b"uint64_t timestamp", b"int32_t ", b"float ")
+"""Some of them stand in the definitions of every log."""
 
 
 def recognises(head: bytes) -> bool:
     """Tell whether the first bytes are of a ULog; one whose header is damaged is known by its definitions."""
-    return head.startswith(MAGIC) or count_definitions(head) >= LEAST_DEFINITIONS
+    if head.startswith(MAGIC):
+        return True
+    return any(word in head for word in _WORDS) and count_definitions(head) >= LEAST_DEFINITIONS
 
 
 def read_log(path: Path, progress: Progress) -> FlightLog:

@@ -174,10 +174,12 @@ class _Scanner:
         return int(self._tables.type_counts[ord(letter)])
 
     def _take_data(self, block: NDArray[np.uint8], frames: NDArray[np.int64]) -> None:
-        for number in np.unique(frames[:, 2]).tolist():
-            mine = frames[frames[:, 2] == number]
-            for size in np.unique(mine[:, 1]).tolist():
-                self._take_rows(block, mine[mine[:, 1] == size, 0], number, size - 3)
+        """Take rows of data messages, (n, 3), in parts of one number and one size each."""
+        key = frames[:, 2] * 65536 + frames[:, 1]
+        order = np.argsort(key, kind="stable")
+        for part in np.split(frames[order], np.flatnonzero(np.diff(key[order])) + 1):
+            if len(part):
+                self._take_rows(block, part[:, 0], int(part[0, 2]), int(part[0, 1]) - 3)
 
     def _take_rows(self, block: NDArray[np.uint8], places: NDArray[np.int64], number: int, size: int) -> None:
         known = self._subscriptions.get(number, [])
@@ -214,12 +216,18 @@ class _Scanner:
     def _take_header(self, message: bytes, offset: int) -> None:
         if message[7] > 1:
             self._note(f"file version {message[7]}: read as version 1")
-        if offset > 0:
-            self._note(f"another header at byte {offset}")
-            self._count_by_name()
-            self._subscriptions.clear()
-            self._tables.least[:], self._tables.most[:], self._tables.learned[:] = 0, -1, 0
-            self._tables.subscribed[:] = self._tables.wanted[:] = False
+        if self.type_count(chr(kernels.HEADER_TYPE)) > 1:
+            self._note(f"another log begins at byte {offset}: both are read as one")
+            self._begin_section()
+
+    def _begin_section(self) -> None:
+        """Forget the definitions: another log begins with its own."""
+        self._count_by_name()
+        for known in (self._formats, self._bytes, self._subscriptions):
+            known.clear()
+        self._open_formats, self._open_subscriptions = [], []
+        self._tables.least[:], self._tables.most[:], self._tables.learned[:] = 0, -1, 0
+        self._tables.known_sizes[:] = self._tables.subscribed[:] = self._tables.wanted[:] = False
 
     def _take_flags(self, body: bytes) -> None:
         incompatible, appended = body[8:16], np.frombuffer(body[16:40], dtype="<u8")
@@ -238,9 +246,9 @@ class _Scanner:
         self._open_formats.append(one)
         while any([self._settle(open_one) for open_one in self._open_formats]):
             self._open_formats = [one for one in self._open_formats if one.name not in self._bytes]
-        for subscription in self._open_subscriptions:
+        for subscription in [waiting for waiting in self._open_subscriptions if waiting.name in self._bytes]:
             self._resolve(subscription)
-        self._open_subscriptions = [one for one in self._open_subscriptions if one.most < 0]
+        self._open_subscriptions = [one for one in self._open_subscriptions if one.name not in self._bytes]
 
     def _settle(self, one: _Format) -> bool:
         """Work out the length of a format, and tell whether that can be done yet: nested ones come first."""
@@ -275,7 +283,7 @@ class _Scanner:
         self._topics.append(one)
         self._tables.subscribed[number] = True
         self._resolve(one)
-        if one.most < 0:
+        if one.name not in self._bytes:
             self._open_subscriptions.append(one)
 
     def _resolve(self, one: _Subscription) -> None:

@@ -197,22 +197,52 @@ def _content_holds(data: NDArray[np.uint8], kind: int, body: int, end: int, tabl
 
 
 @kernel
+def _data_length(
+    data: NDArray[np.uint8], place: int, least: NDArray[np.int32], most: NDArray[np.int32], learned: NDArray[np.int32]
+) -> int:
+    """Return the length of the data message at a place, 0 for none, MORE for more bytes."""
+    n = len(data)
+    if place + 5 > n:
+        return MORE
+    size, number = _two_bytes(data, place), _two_bytes(data, place + 3)
+    fits = least[number] <= size <= most[number] or size == learned[number]
+    if data[place + 2] != _D or size < LEAST_DATA or not fits:
+        return 0
+    return 3 + size if place + 3 + size <= n else MORE
+
+
+@kernel
+def _is_plain(
+    data: NDArray[np.uint8], place: int, least: NDArray[np.int32], most: NDArray[np.int32], learned: NDArray[np.int32]
+) -> bool:
+    """Tell whether a data message begins at a place, another one follows it, and nothing in it looks like a third.
+
+    So it is with nearly all of them; the others are judged at length.
+    """
+    length = _data_length(data, place, least, most, learned)
+    end = place + length
+    if length <= 0 or _data_length(data, end, least, most, learned) <= 0:
+        return False
+    for start in range(place + 1, end):
+        kind = data[start + 2]
+        if kind == _D and _data_length(data, start, least, most, learned) != 0:
+            return False
+        if kind == _S and data[start] == len(_SYNC):
+            return False
+    return True
+
+
+@kernel
 def frame_length(data: NDArray[np.uint8], place: int, tables: Tables) -> int:
     """Return the length of the message that its content says begins at a place, 0 for none, MORE for more bytes."""
     n = len(data)
     if place + 3 > n:
         return MORE
     kind = data[place + 2]
+    if kind == _D:
+        return _data_length(data, place, tables.least, tables.most, tables.learned)
     size = _two_bytes(data, place)
     length = 3 + size
-    if kind == _D:
-        if place + 5 > n:
-            return MORE
-        number = _two_bytes(data, place + 3)
-        fits = tables.least[number] <= size <= tables.most[number] or size == tables.learned[number]
-        if size < LEAST_DATA or not fits:
-            return 0
-        return length if place + length <= n else MORE
     if kind == _HEADER_TYPE:
         if not _begins_with(data, place, _MAGIC):
             return 0
@@ -388,7 +418,10 @@ def scan(
     n, place, synced = len(data), state[PLACE], state[SYNCED] != 0
     answer = DONE
     while place < n and state[FRAMES] < len(frames) and state[SPANS] < len(spans):
-        length, skip, orphan = _judged(data, final, synced, place, tables)
+        if synced and _is_plain(data, place, tables.least, tables.most, tables.learned):
+            length, skip, orphan = 3 + _two_bytes(data, place), 0, False
+        else:
+            length, skip, orphan = _judged(data, final, synced, place, tables)
         if length == MORE:
             break
         if length == 0:
