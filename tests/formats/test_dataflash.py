@@ -304,6 +304,18 @@ def test_messages_that_nothing_defines_are_named(tmp_path: Path) -> None:
     assert any("type 112 begin at 10 places" in note for note in result.notes)
 
 
+def test_a_message_without_time_between_undefined_ones_is_found(tmp_path: Path) -> None:
+    log = MadeLog()
+    log.define("FILE")
+    for k in range(10):
+        log.add("EV", BOOT_US + k, 1)
+        log.add("FILE", b"@SYS/uarts.txt", k, 64, b"what")
+    log.add("EV", BOOT_US, 1)
+    result = read(tmp_path, log)
+    assert result.message_counts == {"FMT": 1, "FILE": 10}
+    assert result.damage.lost_bytes == 11 * log.length("EV")
+
+
 def test_no_definitions_at_all(tmp_path: Path) -> None:
     log = MadeLog()
     for k in range(100):

@@ -206,3 +206,22 @@ def test_a_head_inside_a_payload_is_no_message(tmp_path: Path) -> None:
     assert result.counts["NOIS"] == 200
     assert "EV" not in result.counts
     assert result.damage.lost_bytes == 0
+
+
+def test_a_lost_definition_costs_its_own_messages_only(tmp_path: Path) -> None:
+    log = made(tmp_path, 7)
+    definitions = [(begin, end) for begin, end, name in log.messages if name == "FMT"]
+    names = ["FMT", *(log.types[log.data[begin + 3]] for begin, _ in definitions[1:])]
+    until = definitions[-1][1]
+    path, hit = tmp_path / "hurt.BIN", 0
+    for seed in range(60):
+        hurt = damaged(log.data[: until + 200], np.random.default_rng(seed), longest=150)
+        shift = len(hurt.data) - until - 200
+        path.write_bytes(hurt.data + log.data[until + 200 :])
+        lost = {name for name, (begin, end) in zip(names, definitions, strict=True) if hurt.moved(begin, end) is None}
+        hit += bool(lost)
+        result = read_messages(path, frozenset(log.types.values()))
+        read = {(int(place), name) for name, rows in result.rows.items() for place in rows.places}
+        behind = [(begin + shift, name) for begin, _, name in log.messages if begin >= until + 200]
+        assert {message for message in behind if message[1] not in lost} <= read
+    assert hit > 40

@@ -6,7 +6,7 @@ are no checksums. The rule by which messages are told from damage:
 1. Where the message before ended (or the file begins), a message stands if the head of a known type stands there and
    all its length lies in the file. Elsewhere the next *sure* one is looked for, byte by byte. Sure is a message whose
    time (its first column, TimeUS or TimeMS) is within a minute of that of the message before, an FMT whose length is
-   that of its format characters, or one that a known head, or the end of the file, follows.
+   that of its format characters, or one that a head of any type, or the end of the file, follows.
 2. What a known head or the end of the file follows is accepted, unless messages inside it lead to its very end, at
    least one of them sure by its time or two in a chain: then it was cut short and they are the truth.
 3. What nothing known follows is accepted (the damage is behind it), unless its time is more than a minute away from

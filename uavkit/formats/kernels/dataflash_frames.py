@@ -83,7 +83,8 @@ def is_sure(data: Bytes, q: int, tables: Table, last_us: int) -> bool:
     length = frame_length(data, q, tables[0])
     if length == 0 or q + length > len(data) or data[q + 2] == _FMT:
         return False
-    return q + length == len(data) or frame_length(data, q + length, tables[0]) > 0
+    after = q + length  # what follows may be of a type whose definition is lost
+    return after == len(data) or (after + 1 < len(data) and data[after] == 0xA3 and data[after + 1] == 0x95)
 
 
 @kernel
