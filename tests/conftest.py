@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from uavkit.simulate.survey import Scene, SimulatedSurvey
 
 
@@ -37,3 +39,23 @@ def smallest_survey(smallest_scene: Scene, tmp_path_factory: pytest.TempPathFact
     from uavkit.simulate.survey import simulate_survey
 
     return simulate_survey(tmp_path_factory.mktemp("smallest_survey"), smallest_scene.options)
+
+
+@pytest.fixture(scope="session")
+def rtk_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a flight with RTK: twelve stills of 800 x 600 with stamps of whole seconds, no video."""
+    from uavkit import workflow
+
+    folder = tmp_path_factory.mktemp("rtk_flight")
+    options = {
+        "scale": 0.2,
+        "strips": 2,
+        "stations_per_strip": 6,
+        "video_standard": "none",
+        "gnss_sigma_m": 0.02,
+        "gnss_outliers": 0,
+        "check_points": 8,
+        "workers": 2,
+    }
+    assert "positions.csv" in workflow.simulate(folder, options)
+    return folder

@@ -1,8 +1,6 @@
 """The chain without a control point: RTK positions alone fix the block, as well as the adjustment says."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -10,29 +8,14 @@ from uavkit import workflow
 from uavkit.core.adjustment import Datum
 from uavkit.project import IngestOptions, Project
 
-RTK: Mapping[str, Any] = {
-    "scale": 0.2,
-    "strips": 2,
-    "stations_per_strip": 4,
-    "video_standard": "none",
-    "gnss_sigma_m": 0.02,
-    "gnss_outliers": 0,
-    "control_points": 0,
-    "check_points": 8,
-    "workers": 2,
-}
 
-
-def test_rtk_positions_fix_a_block_as_well_as_predicted(tmp_path: Path) -> None:
+def test_rtk_positions_fix_a_block_as_well_as_predicted(rtk_flight: Path, tmp_path: Path) -> None:
     """Chi-square of all coordinates of the check points with their joint covariance, 0.1 % each side; centimetres."""
-    flight, project = tmp_path / "flight", Project(tmp_path / "survey")
-    command = workflow.simulate(flight, RTK)
-    assert "positions.csv" in command
-    assert "control" not in command
+    project = Project(tmp_path / "survey")
     originals = {
-        "images": flight / "stills",
-        "positions": flight / "positions.csv",
-        "check_points": flight / "check_points.csv",
+        "images": rtk_flight / "stills",
+        "positions": rtk_flight / "positions.csv",
+        "check_points": rtk_flight / "check_points.csv",
     }
     workflow.begin_survey(project, originals, IngestOptions())
     workflow.ingest(project)

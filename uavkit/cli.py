@@ -180,51 +180,90 @@ def simulate(
     typer.echo(f"Go on with: {made}")
 
 
+FlightLogs = Annotated[
+    list[Path] | None,
+    typer.Option(help="Flight log of any kind: the stills are matched with its exposures; may be repeated."),
+]
+ListedPositions = Annotated[
+    list[Path] | None,
+    typer.Option(help="KML, KMZ or CSV of the exposure positions; may be repeated, in the order of the flights."),
+]
+FlownPlan = Annotated[
+    Path | None,
+    typer.Option(help="Plan of the flight (.plan, .waypoints, its _exposures.csv): told against what was taken."),
+]
+HeightsFrom = Annotated[
+    Literal["ellipsoid", "geoid", "unknown"] | None,
+    typer.Option(help="What the heights of the positions count from; else as their file says."),
+]
+PixelsFrom = Annotated[
+    Literal["centre", "corner"] | None,
+    typer.Option(help="What (0, 0) is in the marks: centre or corner of the first pixel; else as the file says."),
+]
+LeverArm = Annotated[
+    str, typer.Option(help="From the camera to the GNSS antenna: forward,right,down in m.", metavar="F,R,D")
+]
+GivenMatches = Annotated[
+    Path | None, typer.Option(help="CSV that says which still belongs to which exposure, for what is ambiguous.")
+]
+
+
 @app.command()
 def ingest(
     survey: Survey,
-    images: Annotated[Path, typer.Option(help="Folder of the stills.", show_default=False)],
+    images: Annotated[list[Path], typer.Option(help="Folder of the stills; may be repeated.", show_default=False)],
     camera: Annotated[
         str, typer.Option(help="As 'uavkit cameras' lists it, or a camera file; else as EXIF says.")
     ] = "",
     video: Annotated[Path | None, typer.Option(help="Video of the finder.")] = None,
-    positions: Annotated[Path | None, typer.Option(help="KML, KMZ or CSV of the exposure positions.")] = None,
+    log: FlightLogs = None,
+    positions: ListedPositions = None,
+    plan: FlownPlan = None,
+    match: GivenMatches = None,
     control_points: Annotated[Path | None, typer.Option(help="Ground control points with their marks.")] = None,
     check_points: Annotated[Path | None, typer.Option(help="Check points with their marks, held back.")] = None,
-    height_datum: Annotated[
-        Literal["ellipsoid", "geoid", "unknown"] | None,
-        typer.Option(help="What the heights of the positions count from; else as their file says."),
-    ] = None,
+    height_datum: HeightsFrom = None,
     crs: Annotated[str, typer.Option(help="EPSG code of the results; else that of the control file, else UTM.")] = "",
-    pixel_origin: Annotated[
-        Literal["centre", "corner"] | None,
-        typer.Option(help="What (0, 0) is in the marks: centre or corner of the first pixel; else as the file says."),
-    ] = None,
+    pixel_origin: PixelsFrom = None,
+    lever_arm: LeverArm = "0,0,0",
+    shutter_latency: Annotated[float, typer.Option(help="From an exposure event of a log to the exposure, s.")] = 0.0,
+    latency_sigma: Annotated[
+        float, typer.Option(help="How far that may be off, s: the adjustment estimates the rest; 0 holds it.", min=0.0)
+    ] = 0.1,
 ) -> None:
-    """Bring stills, video, positions and control together into a block. The originals stay where they are."""
+    """Bring stills, video, logs, positions and control together into a block. The originals stay where they are."""
     from uavkit import workflow
     from uavkit.project import IngestOptions, Project
 
-    originals = {
-        "images": images,
-        "video": video,
-        "positions": positions,
-        "control_points": control_points,
-        "check_points": check_points,
-        "camera": Path(camera) if camera.lower().endswith(".toml") else None,
+    own_camera = Path(camera) if camera.lower().endswith(".toml") else None
+    originals: dict[str, Path | list[Path] | None] = {
+        "images": images[0] if len(images) == 1 else images,
+        **{"video": video, "log": log, "positions": positions, "plan": plan, "match": match, "camera": own_camera},
+        **{"control_points": control_points, "check_points": check_points},
     }
     options = IngestOptions(
-        camera="" if originals["camera"] else camera,
+        camera="" if own_camera else camera,
         height_datum=height_datum or "",
         crs=crs,
         pixel_origin=pixel_origin or "",
+        lever_arm_m=_lever_arm(lever_arm),
+        shutter_latency_s=shutter_latency,
+        latency_sigma_s=latency_sigma,
     )
     project = Project(survey)
     with project.locked(), progress_shown() as progress:
-        workflow.begin_survey(project, {role: path for role, path in originals.items() if path is not None}, options)
+        workflow.begin_survey(project, {role: path for role, path in originals.items() if path}, options)
         block = workflow.ingest(project, progress)
     _say(block_summary(block))
     typer.echo(f"Block: {project.block_file}\nNext: uavkit process {survey}")
+
+
+def _lever_arm(text: str) -> tuple[float, float, float]:
+    try:
+        forward, right, down = (float(part) for part in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"--lever-arm {text!r}: give forward,right,down in metres, like 0.2,0,-0.3") from None
+    return forward, right, down
 
 
 @app.command()

@@ -20,7 +20,8 @@ from uavkit.formats.camera_profiles import camera_folder, load_camera, read_came
 from uavkit.formats.control_file import ControlFileOptions, PixelOrigin, SurveyedPoints, read_surveyed_points
 from uavkit.formats.image_files import FileStillSource
 from uavkit.formats.kml import KmlPositions
-from uavkit.formats.positions_file import ImagePositions, read_image_positions
+from uavkit.formats.match_file import read_matches, write_matches
+from uavkit.formats.positions_file import ImagePositions, joined_image_positions, read_image_positions
 from uavkit.formats.video import FileVideoSource
 from uavkit.project import IngestOptions, Manifest, Original, Project, Stage, Standing
 
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 
 SIMULATION_LABEL = "simulation.json"
 """Beside simulated stills: which flight they repeat. It holds no truth."""
+MATCHES = "exposures.csv"
+"""In the folder of ingest: which still has which exposure; a copy of it, edited, is what --match takes."""
 AS_IN_THE_PAPER: Mapping[str, Any] = {
     "terrain": "embankment",
     "texture": "mixed",
@@ -127,9 +130,10 @@ def flight_log(path: Path, progress: Progress = silent) -> "FlightLog":
 def export_log(path: Path, target: str, folder: Path, progress: Progress = silent) -> list[Path]:
     """Write the contents of a flight log into a folder for other programs, and return the files."""
     from uavkit.formats.flight_logs import open_log
+    from uavkit.formats.log_export import ExportKind
     from uavkit.formats.log_export import export_log as write_log
 
-    return write_log(open_log(path, progress), folder, target)
+    return list(write_log(open_log(path, progress), folder, ExportKind(target)))
 
 
 def begin_survey(project: Project, originals: Mapping[str, Path | Sequence[Path]], options: IngestOptions) -> None:
@@ -154,34 +158,52 @@ def choose_settings(project: Project, settings: Sequence[str]) -> None:
 
 def ingest(project: Project, progress: Progress = silent) -> Block:
     """Make the block of a survey and keep it."""
+    from uavkit.ingest.logged_stills import rows_of_matches
+
     with project.running(Stage.INGEST):
         block = _built_block(project, progress)
+        if block.exposures is not None:
+            write_matches(project.stage_folder(Stage.INGEST) / MATCHES, rows_of_matches(block.exposures))
         write_block(project.block_file, block)
     return block
 
 
 def _built_block(project: Project, progress: Progress) -> Block:
     from uavkit.ingest.build_block import IngestOptions, Sources, build_block
+    from uavkit.ingest.log_positions import LogOptions
+    from uavkit.ingest.logged_stills import GivenMatches
+    from uavkit.plan.expected import expected_positions
 
-    told, positions, camera = (
-        project.manifest.ingest,
-        project.original_path("positions"),
-        project.original_path("camera"),
-    )
+    told, camera = project.manifest.ingest, project.original_path("camera")
+    plan_file, match = project.original_path("plan"), project.original_path("match")
     sources = Sources(
         stills=_stills(project),
         video=_video(project),
-        positions=_listed_positions(positions) if positions else None,
+        logs=tuple(flight_log(path, progress) for path in project.original_paths("log")),
+        positions=_listed_positions(project.original_paths("positions")),
+        given=GivenMatches(rows=read_matches(match), source=str(match)) if match else GivenMatches(),
+        planned=expected_positions(plan_file) if plan_file else (),
         control=_surveyed(project, "control_points"),
         check=_surveyed(project, "check_points"),
     )
     profile = read_camera(camera) if camera else load_camera(told.camera) if told.camera else None
-    datum = HeightDatum(told.height_datum) if told.height_datum else None
-    return build_block(sources, profile, IngestOptions(crs=told.crs, height_datum=datum), progress)
+    options = IngestOptions(
+        crs=told.crs,
+        height_datum=HeightDatum(told.height_datum) if told.height_datum else None,
+        logs=LogOptions(lever_arm_m=told.lever_arm_m, shutter_latency_s=told.shutter_latency_s),
+        latency_sigma_s=told.latency_sigma_s,
+    )
+    return build_block(sources, profile, options, progress)
 
 
-def _listed_positions(path: Path) -> KmlPositions | ImagePositions:
-    return KmlPositions(path) if path.suffix.lower() in (".kml", ".kmz") else read_image_positions(path)
+def _listed_positions(paths: Sequence[Path]) -> KmlPositions | ImagePositions | None:
+    """Return the positions of one or several files of a kind, one behind the other."""
+    if not paths:
+        return None
+    kml = [path for path in paths if path.suffix.lower() in (".kml", ".kmz")]
+    if kml and len(kml) < len(paths):
+        raise InputError(f"{paths[0]} and {paths[-1]}: give KML files or CSV files as positions, not both")
+    return KmlPositions(*kml) if kml else joined_image_positions([read_image_positions(path) for path in paths])
 
 
 def _surveyed(project: Project, role: str) -> SurveyedPoints | None:

@@ -80,7 +80,7 @@ def test_kmz_and_override(tmp_path: Path) -> None:
     path = tmp_path / "way.kmz"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("doc.kml", kml(point("A", "139,35,77", "absolute")))
-    source = KmlPositions(path, HeightDatum.ELLIPSOID)
+    source = KmlPositions(path, override=HeightDatum.ELLIPSOID)
     assert isinstance(source, GnssReceiver)
     assert [(f.height_m, f.height_datum) for f in source.fixes()] == [(77.0, HeightDatum.ELLIPSOID)]
     assert [f.height_datum for f in KmlPositions(path).fixes()] == [HeightDatum.GEOID]

@@ -73,9 +73,9 @@ def test_each_flight_has_its_shift_and_residuals(result: OrientedBlock) -> None:
 def test_latencies_stand_beside_the_shifts(result: OrientedBlock) -> None:
     adjustment = replace(result.adjustment, gnss_latency_s=np.array([-0.0834]), gnss_latency_sigma_s=np.array([0.0042]))
     table = gnss_shift_table(replace(result, adjustment=adjustment))
-    assert (table.header[-1], table.rows[0][-1]) == ("Latency [ms]", "-83.4 ± 4.2")
-    assert "later moment" in table.note
-    assert "Latency [ms]" not in gnss_shift_table(result).header
+    assert (table.header[-1], table.rows[0][-1]) == ("Shutter latency [ms]", "+83.4 ± 4.2")
+    assert "--shutter-latency" in table.note
+    assert "Shutter latency [ms]" not in gnss_shift_table(result).header
 
 
 def test_rejected_control_points_are_marked(result: OrientedBlock) -> None:

@@ -10,6 +10,8 @@ class StillState(Enum):
     """What is known of a still's exposure event."""
 
     MATCHED = "matched"
+    DOUBLED = "doubled"
+    """Several events tell its exposure, tenths of a second apart: one of them is taken, with a sigma that says so."""
     GIVEN = "given"
     """By the user's file."""
     AMBIGUOUS = "ambiguous"
@@ -28,7 +30,9 @@ class StillExposure:
     probability: float
     """Of the pair; of the best pair where it is ambiguous; 0 without an event."""
     event: int | None = None
-    """Number of the event, from 1."""
+    """Number of the event among those of all logs, from 1."""
+    label: str = ""
+    """What the user knows the event by: its log and its number there."""
     gps_time_ns: int | None = None
     """Of the exposure, the shutter's configured latency included."""
     position: GnssFix | None = None
@@ -51,9 +55,10 @@ class UnusedEvent:
 class CameraClock:
     """The camera's clock against GPS time, for a group of stills that one offset explains."""
 
-    stills: int
+    stills: tuple[str, ...]
+    reference_gps_ns: int
     offset_s: float
-    """Camera's clock (read as UTC) minus GPS time in the middle of the group."""
+    """Camera's clock (read as UTC) minus GPS time at the reference."""
     offset_sigma_s: float
     drift_ppm: float
     drift_sigma_ppm: float

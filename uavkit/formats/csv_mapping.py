@@ -114,6 +114,7 @@ def check_mapping(mapping: CsvMapping, where: Path) -> None:
 
 
 def given_columns(mapping: CsvMapping) -> dict[str, str]:
+    """Return the file's columns that the mapping names, by what they mean."""
     return {name: column for name, column in mapping.columns.model_dump().items() if column}
 
 

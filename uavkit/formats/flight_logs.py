@@ -3,8 +3,6 @@
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
-
 from uavkit.core.errors import InputError
 from uavkit.core.flight_log import FlightLog, LogKind
 from uavkit.core.progress import Progress, silent
@@ -40,18 +38,20 @@ def open_log(path: Path, progress: Progress = silent) -> FlightLog:
 
 def _readers() -> tuple[LogReader, ...]:
     """Return the readers, those whose marks are surest first."""
-    return ()
+    from uavkit.formats import csv_log, dataflash, dataflash_text, dji_mrk, dji_srt, gpx, kml_log, nmea, tlog, ubx, ulog
+
+    return (ulog, dataflash, tlog, ubx, kml_log, gpx, dji_srt, dji_mrk, dataflash_text, nmea, csv_log)
 
 
 def _head(path: Path) -> bytes:
     """Return the first bytes from the first that is not zero."""
     if path.is_dir():
         raise InputError(f"{path}: is a folder: give the log file in it")
+    zeros = bytes(_BLOCK_BYTES)
     with opened(path) as stream:
         while block := stream.read(_BLOCK_BYTES):
-            filled = np.flatnonzero(np.frombuffer(block, dtype=np.uint8))
-            if len(filled):
-                rest = block[int(filled[0]) : int(filled[0]) + HEAD_BYTES]
+            if block != zeros[: len(block)]:
+                rest = block.lstrip(b"\0")[:HEAD_BYTES]
                 return rest + stream.read(HEAD_BYTES - len(rest))
         if stream.tell() == 0:
             raise InputError(f"{path}: the file is empty: download it again")

@@ -22,11 +22,11 @@ from uavkit.formats.kml_document import child_text, coordinate_tuples, local_nam
 
 
 class KmlPositions:
-    """Fills ``GnssReceiver`` from a KML or KMZ file, in the order of the document."""
+    """Fills ``GnssReceiver`` from KML or KMZ files, one behind the other, each in the order of its document."""
 
-    def __init__(self, path: Path, override: HeightDatum | None = None) -> None:
-        """Read the file; ``override`` replaces the datum that the file's altitude mode states."""
-        fixes = read_positions(path)
+    def __init__(self, *paths: Path, override: HeightDatum | None = None) -> None:
+        """Read the files; ``override`` replaces the datum that a file's altitude mode states."""
+        fixes = tuple(fix for path in paths for fix in read_positions(path))
         self._fixes = fixes if override is None else tuple(replace(fix, height_datum=override) for fix in fixes)
 
     def fixes(self) -> Iterator[GnssFix]:

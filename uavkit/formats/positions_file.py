@@ -75,6 +75,21 @@ def read_image_positions(path: Path) -> ImagePositions:
     )
 
 
+def joined_image_positions(files: Sequence[ImagePositions]) -> ImagePositions:
+    """Return the positions of several files as one; raises InputError where two state different common sigmas."""
+    if len(files) == 1:
+        return files[0]
+    shifts = {one.shift_sigma_m for one in files}
+    if len(shifts) > 1:
+        raise InputError(f"{files[0].source} and {files[-1].source} state different shift_sigma_m: make them alike")
+    return ImagePositions(
+        fixes=tuple(fix for one in files for fix in one.fixes),
+        lines=tuple(line for one in files for line in one.lines),
+        shift_sigma_m=shifts.pop(),
+        source=", ".join(one.source for one in files),
+    )
+
+
 def write_image_positions(path: Path, positions: ImagePositions) -> None:
     """Write the CSV in degrees, whole or not at all; raises InputError for mixed datums of heights."""
     datums = {fix.height_datum for fix in positions.fixes}

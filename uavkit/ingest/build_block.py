@@ -10,6 +10,7 @@ from uavkit.core.block import Block, VideoSync
 from uavkit.core.camera import CameraProfile
 from uavkit.core.devices import GnssReceiver, StillSource, VideoSource
 from uavkit.core.errors import InputError
+from uavkit.core.flight_log import FlightLog
 from uavkit.core.frames import LocalFrame, ellipsoid_heights_m, geographic_from_crs, parse_crs
 from uavkit.core.heights import HeightDatum
 from uavkit.core.observations import GnssObservations
@@ -19,6 +20,9 @@ from uavkit.core.records import GnssFix, StillInfo
 from uavkit.formats.control_file import SurveyedPoints
 from uavkit.formats.positions_file import ImagePositions
 from uavkit.ingest.control import MarkedPoints, height_notes, local_points, match_marks
+from uavkit.ingest.log_positions import LogOptions, listed_fixes
+from uavkit.ingest.logged_stills import GivenMatches, LoggedStills, stills_in_logs
+from uavkit.ingest.planned import join_planned, planned_notes
 from uavkit.ingest.positions import (
     JoinedPositions,
     PositionOptions,
@@ -44,9 +48,15 @@ class Sources:
 
     stills: StillSource
     video: VideoSource | None = None
+    logs: tuple[FlightLog, ...] = ()
+    """Flight logs: the stills are matched with their exposures, and placed by their fixes."""
     positions: GnssReceiver | ImagePositions | None = None
-    """Listed positions; without them the stills' EXIF positions are used. Those that name their images are joined by
-    these names alone."""
+    """Listed positions; they go before those of logs, which go before those of EXIF. Those that name their images are
+    joined by these names alone."""
+    given: GivenMatches = field(default_factory=GivenMatches)
+    """What the user says of stills and exposures."""
+    planned: tuple[GnssFix, ...] = ()
+    """Where the plan takes pictures: told against what was taken, and used where nothing else tells positions."""
     control: SurveyedPoints | None = None
     check: SurveyedPoints | None = None
 
@@ -63,8 +73,9 @@ class IngestOptions:
     """A priori sigma of the vertical shift of positions whose height datum is unknown."""
     known_datum_sigma_m: float = 2.0
     """The same of the horizontal shift, beside an unknown height datum."""
-    lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """From the projection centre to the antenna, in image space: x right, y up, z to the viewer."""
+    logs: LogOptions = field(default_factory=LogOptions)
+    latency_sigma_s: float = 0.1
+    """A priori sigma of what the stated shutter latency may be off, where velocities are known; 0 holds it."""
     positions: PositionOptions = field(default_factory=PositionOptions)
     sync: SyncOptions = field(default_factory=SyncOptions)
 
@@ -99,7 +110,8 @@ def build_block(
         notes += (f"{len(missing)} stills cannot be read and are left out: {_reasons(missing)}",)
     notes += check_overlap(stills, prepared.pictures, sources.video)
     sync, sync_notes = _video(sources.video, stills, prepared, options, progress)
-    joined = _positions(sources.positions, stills, tuple(missing), options)
+    logged = stills_in_logs(stills, sources.logs, sources.given, options.logs, progress)
+    joined = _positions(sources, stills, tuple(missing), logged, options)
     control = _marked(sources.control, stills, tuple(missing))
     check = _marked(sources.check, stills, tuple(missing))
     block = Block(
@@ -108,9 +120,13 @@ def build_block(
         stills=stills,
         frame=_frame(joined, control.surveyed, check.surveyed, options),
         video=sync,
-        notes=(*notes, *sync_notes, *joined.notes, *joined.discarded, *control.notes, *check.notes),
+        exposures=logged.matches,
+        notes=(*notes, *sync_notes, *logged.notes, *joined.notes, *joined.discarded, *control.notes, *check.notes),
     )
-    block = _with_positions(block, joined, options, bool(control.surveyed.points))
+    arm_m, arm_notes = _lever_arm(logged, joined, options)
+    block = _with_positions(
+        replace(block, notes=(*block.notes, *arm_notes)), joined, arm_m, options, len(control.surveyed.points)
+    )
     stated = sources.positions.shift_sigma_m if isinstance(sources.positions, ImagePositions) else None
     block = _with_common_sigma(block, joined, stated, len(control.surveyed.points))
     return _with_points(block, control, check)
@@ -140,20 +156,37 @@ def _video(
 
 
 def _positions(
-    source: GnssReceiver | ImagePositions | None,
+    sources: Sources,
     stills: Sequence[StillInfo],
     absent: Sequence[str],
+    logged: LoggedStills,
     options: IngestOptions,
 ) -> JoinedPositions:
-    """Return listed positions, else those in EXIF; with the height datum that counts."""
-    if isinstance(source, ImagePositions):
-        return _with_datum(join_named(stills, source, absent), options)
-    fixes = list(source.fixes()) if source is not None else []
-    joined = join_positions(stills, fixes, absent, options.positions) if fixes else exif_positions(stills)
-    if fixes and joined.count == 0 and any(info.position is not None for info in stills):
-        own = exif_positions(stills)
-        joined = replace(own, notes=(*joined.notes, *own.notes), discarded=joined.discarded)
+    """Return listed positions, else those of logs, of EXIF, of the plan; with the height datum that counts."""
+    joined = _best_positions(sources, stills, absent, logged, options)
+    if sources.planned:
+        joined = replace(joined, notes=(*joined.notes, *planned_notes(sources.planned, joined)))
     return _with_datum(joined, options)
+
+
+def _best_positions(
+    sources: Sources,
+    stills: Sequence[StillInfo],
+    absent: Sequence[str],
+    logged: LoggedStills,
+    options: IngestOptions,
+) -> JoinedPositions:
+    if isinstance(sources.positions, ImagePositions):
+        return join_named(stills, sources.positions, absent)
+    fixes = list(sources.positions.fixes()) if sources.positions is not None else listed_fixes(sources.logs)
+    joined = join_positions(stills, fixes, absent, options.positions) if fixes else None
+    if joined is not None and joined.count:
+        return joined
+    notes, discarded = (joined.notes, joined.discarded) if joined is not None else ((), ())
+    found = logged.joined if logged.joined.count else exif_positions(stills)
+    if not found.count and sources.planned:
+        found = join_planned(stills, sources.planned, absent, options.positions)
+    return replace(found, notes=(*notes, *found.notes), discarded=(*discarded, *found.discarded))
 
 
 def _with_datum(joined: JoinedPositions, options: IngestOptions) -> JoinedPositions:
@@ -216,8 +249,10 @@ def _frame(
     return LocalFrame.at(latitude, longitude, round(float(np.median(heights)), 2) if len(heights) else 0.0, crs)
 
 
-def _with_positions(block: Block, joined: JoinedPositions, options: IngestOptions, has_control: bool) -> Block:
-    """Add the positions as observations."""
+def _with_positions(
+    block: Block, joined: JoinedPositions, lever_arm_m: tuple[float, float, float], options: IngestOptions, control: int
+) -> Block:
+    """Add the positions as observations; the lever arm is in image space, zero where attitudes took it off."""
     rows = [index for index, fix in enumerate(joined.fixes) if fix is not None]
     if not rows or block.frame is None:
         return block
@@ -232,20 +267,41 @@ def _with_positions(block: Block, joined: JoinedPositions, options: IngestOption
         notes.append("the positions' heights count from the ground or are missing: only their horizontal part is used")
     elif datum is HeightDatum.UNKNOWN:
         notes.append("the datum of the positions' heights is unknown: taken as ellipsoidal, state it by --height-datum")
-        if not has_control:
+        if not control:
             shift = (options.known_datum_sigma_m, options.known_datum_sigma_m, options.unknown_datum_sigma_m)
             notes.append(
                 f"without control, all heights may be off by some {options.unknown_datum_sigma_m:g} m together"
             )
+    single = np.zeros(len(rows), dtype=np.int64)
+    velocity = np.nan_to_num(joined.velocity_m_s[rows]) if joined.velocity_m_s is not None else None
     gnss = GnssObservations(
         image_index=np.array(rows, dtype=np.int64),
         position_m=block.frame.enu_from_geographic(*place.T),
         sigma_m=sigma_m,
-        flight=np.zeros(len(rows), dtype=np.int64),
-        lever_arm_m=options.lever_arm_m,
+        flight=np.unique(joined.flight[rows], return_inverse=True)[1] if joined.flight is not None else single,
+        lever_arm_m=lever_arm_m,
         shift_sigma_m=shift,
+        velocity_m_s=velocity,
+        latency_sigma_s=options.latency_sigma_s if velocity is not None and options.latency_sigma_s > 0 else None,
     )
     return replace(block, gnss=gnss, notes=(*block.notes, *notes))
+
+
+def _lever_arm(
+    logged: LoggedStills, joined: JoinedPositions, options: IngestOptions
+) -> tuple[tuple[float, float, float], tuple[str, ...]]:
+    """Return the lever arm that the adjustment has to turn, in image space, and notes.
+
+    Attitudes of a log turn it at once. Without them the camera is taken to be fixed to the vehicle, looking down with
+    the top of its image forward: right, forward, up are then x, y, z of image space.
+    """
+    forward, right, down = options.logs.lever_arm_m
+    if not any((forward, right, down)):
+        return (0.0, 0.0, 0.0), ()
+    if joined.flight is not None and logged.lever_arm_taken_off:
+        return (0.0, 0.0, 0.0), ("lever arm turned by the logged attitudes and taken off the positions",)
+    note = "lever arm turned with the camera, taken as fixed to the vehicle, looking down with its top forward"
+    return (right, forward, -down), (note,)
 
 
 def _with_common_sigma(

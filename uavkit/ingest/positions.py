@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from uavkit.core.arrays import Array, Flags
+from uavkit.core.arrays import Array, Flags, Indices
 from uavkit.core.errors import InputError
 from uavkit.core.frames import LocalFrame
 from uavkit.core.records import GnssFix, StillInfo
@@ -76,6 +76,10 @@ class JoinedPositions:
     discarded: tuple[str, ...]
     """Positions that belong to no still, with the reason."""
     notes: tuple[str, ...]
+    velocity_m_s: Array | None = None
+    """(n, 3) east, north, up of the antenna, NaN where unknown; None where nothing tells it."""
+    flight: Indices | None = None
+    """(n,) number of the flight; None: all are of one."""
 
     @property
     def count(self) -> int:

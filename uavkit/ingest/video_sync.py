@@ -199,7 +199,8 @@ def _by_events(
             "is it the video of this flight?"
         )
         return SyncOutcome(sync=None, notes=tuple(notes))
-    evidence = _with_tone(scene, views, _evidence(scene, views, matches, common), (common, rough.matrix))
+    by_detail = _evidence(scene, views, matches, common)
+    evidence = _with_tone(scene, views, (matches, by_detail), (common, rough.matrix))
     alignment = _align(scene, events, evidence)
     pairs = [(int(i), int(j)) for i, j in alignment.pairs]
     certain = [(i, j) for i, j in pairs if evidence[i, j] > 0]
@@ -372,24 +373,32 @@ MOST_BY_TONE = 8
 """Pairs that give the transformation by tone."""
 TONE_EVIDENCE = ((0.4, 0.7), (-8.0, 8.0))
 """Correlations of tone, and the evidence that they are."""
+TONE_AGAINST_DETAIL = 2.0
+"""The most that tone counts for a pair whose detail was found elsewhere: less than detail in its place."""
 
 
 def _with_tone(
-    scene: _Scene, views: list[_EventView], evidence: Array, known: tuple[AffineTransformation, Array]
+    scene: _Scene,
+    views: list[_EventView],
+    found: tuple[dict[tuple[int, int], ContentMatch], Array],
+    known: tuple[AffineTransformation, Array],
 ) -> Array:
-    """Return the evidence (n, m) with that of tone, for pairs that time leaves open.
+    """Return the evidence (n, m), found by matches of detail, with that of tone, for pairs that time leaves open.
 
     Where all ground looks alike, detail finds no match for the right pair and may find one for a wrong: then tone
     decides. It decides nothing where there is none.
     """
-    common, likely = known
+    (matches, evidence), (common, likely) = found, known
     result = evidence.copy()
     for i, j in np.argwhere(likely > 1e-5).tolist():
         likeness = tone_likeness(views[j].picture, scene.stills[scene.infos[i].name].reduced, common)
         if likeness is None:
             continue
         by_tone = float(np.interp(likeness, *TONE_EVIDENCE))
-        result[i, j] = min(evidence[i, j], by_tone) if evidence[i, j] > 0 else by_tone
+        if evidence[i, j] > 0:
+            result[i, j] = min(evidence[i, j], by_tone)
+        else:
+            result[i, j] = min(by_tone, TONE_AGAINST_DETAIL) if (i, j) in matches else by_tone
     return result
 
 

@@ -23,7 +23,7 @@ from uavkit.formats.drawing import (
     plain_axes,
     shortened,
 )
-from uavkit.report import figures_pictures, figures_precision
+from uavkit.report import figures_exposures, figures_pictures, figures_precision
 from uavkit.report.coverage import Ground, extent_m, exteriors, footprint_m, ground_surface, overlap_counts
 from uavkit.report.measures import determined_points, length_unit, rays_of_points, view_tilts_deg
 
@@ -259,5 +259,6 @@ OTHERS: tuple[Callable[[OrientedBlock], Drawing], ...] = (
     ray_count_histogram,
     *figures_precision.ALL,
     *figures_pictures.ALL,
+    figures_exposures.camera_clock,
 )
 COUNT = len(ON_GROUND) + len(OTHERS)

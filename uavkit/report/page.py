@@ -11,7 +11,7 @@ from uavkit.core.progress import Progress, silent
 from uavkit.core.result import OrientedBlock
 from uavkit.formats.atomic import atomic_path, write_text
 from uavkit.formats.html_page import document, figure_html, number, section, table_html
-from uavkit.report import tables
+from uavkit.report import exposure_tables, tables
 from uavkit.report.coverage import ground_surface
 from uavkit.report.measures import accuracy, length_unit
 from uavkit.report.relative import relative_precision
@@ -53,6 +53,7 @@ def write_report(
         _block_section(result, pictures),
         _image_section(result, pictures),
         _gnss_section(result, pictures),
+        _exposure_section(result, pictures),
         _interior_section(result, pictures),
         _points_section(result, pictures),
         _process_section(result),
@@ -242,6 +243,21 @@ def _gnss_section(result: OrientedBlock, pictures: dict[str, str]) -> str:
         table_html(tables.gnss_shift_table(result)),
         pictures["gnss_residuals"],
         table_html(rejected) if rejected.rows else "<p>No GNSS position was rejected.</p>",
+    )
+
+
+def _exposure_section(result: OrientedBlock, pictures: dict[str, str]) -> str:
+    matches = result.block.exposures
+    if matches is None:
+        return ""
+    clocks, unused = exposure_tables.clock_table(matches), exposure_tables.unused_table(matches)
+    return section(
+        "Stills and exposures",
+        f"<p>{escape(exposure_tables.summary_sentence(matches))}</p>",
+        table_html(clocks) if clocks.rows else "<p>The camera's clock could not be told.</p>",
+        pictures["camera_clock"],
+        table_html(unused) if unused.rows else "<p>Each exposure has its still.</p>",
+        table_html(exposure_tables.exposures_table(matches)),
     )
 
 

@@ -317,10 +317,10 @@ def gnss_shift_table(result: OrientedBlock) -> Table:
     header += tuple(f"RMS residual {a} [{unit}]" for a in ("E", "N", "U"))
     note = "" if gnss is None or len(names) else "No position takes part in the adjustment."
     if len(adjusted.gnss_latency_s):
-        header += ("Latency [ms]",)
-        latencies = zip(1e3 * adjusted.gnss_latency_s, 1e3 * adjusted.gnss_latency_sigma_s, strict=True)
+        header += ("Shutter latency [ms]",)
+        latencies = zip(-1e3 * adjusted.gnss_latency_s, 1e3 * adjusted.gnss_latency_sigma_s, strict=True)
         rows = [(*row, f"{_signed(a, 1)} ± {number(b, 1)}") for row, (a, b) in zip(rows, latencies, strict=True)]
-        note += " Latency: by how much the positions are those of a later moment than the exposures."
+        note += " Shutter latency: how much later than stated the exposures were; ingest takes it as --shutter-latency."
     return Table(title="GNSS positions by flight", header=header, rows=tuple(rows), note=note.strip())
 
 

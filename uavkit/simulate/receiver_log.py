@@ -30,7 +30,7 @@ def write_receiver_log(path: Path, flight: Flight, shift_m: Array, options: Simu
     rng = np.random.default_rng([options.seed, 14])
     sigma_m = max(options.gnss_sigma_m, 0.001)
     times_ns = _epochs_ns(flight)
-    times_s = (times_ns - gps_time_ns(0.0)) * 1e-9
+    times_s: Array = np.asarray((times_ns - gps_time_ns(0.0)) * 1e-9, dtype=np.float64)
     measured_m = flight.positions_m(times_s) + shift_m + rng.normal(0.0, sigma_m, (len(times_s), 3))
     velocity = (flight.positions_m(times_s + 0.05) - flight.positions_m(times_s - 0.05)) / 0.1
     velocity += rng.normal(0.0, VELOCITY_SIGMA_M_S, velocity.shape)

@@ -1,0 +1,50 @@
+"""The plan of a flight against what was taken: stations without a still, and planned positions where no others are."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from uavkit.core.arrays import Array
+from uavkit.core.frames import LocalFrame
+from uavkit.core.records import GnssFix, StillInfo
+from uavkit.ingest.positions import JoinedPositions, PositionOptions, join_positions
+
+PLANNED_SIGMA_M = 5.0
+"""Of a planned position as that of the still: vehicles cut corners and trigger late."""
+TAKEN_SHARE = 0.75
+"""A station counts as taken if a still lies nearer than this share of the usual distance between stations."""
+MOST_NAMED = 12
+
+
+def join_planned(
+    infos: Sequence[StillInfo], planned: Sequence[GnssFix], absent: Sequence[str], options: PositionOptions
+) -> JoinedPositions:
+    """Return planned positions as those of the stills, as far as order and distances settle them."""
+    rough = [replace(fix, sigma_horizontal_m=PLANNED_SIGMA_M, sigma_vertical_m=PLANNED_SIGMA_M) for fix in planned]
+    joined = join_positions(infos, rough, absent, options)
+    note = f"positions are those of the plan, with a sigma of {PLANNED_SIGMA_M:g} m: nothing tells better ones"
+    return replace(joined, notes=(note, *joined.notes))
+
+
+def planned_notes(planned: Sequence[GnssFix], joined: JoinedPositions) -> tuple[str, ...]:
+    """Return what became of the planned exposures, by the stills' positions."""
+    fixes = [fix for fix in joined.fixes if fix is not None]
+    stills = len(joined.fixes)
+    counted = f"the plan has {len(planned)} exposures, there are {stills} stills"
+    if len(fixes) < 3 or len(planned) < 2:
+        return (counted,)
+    frame = LocalFrame.at(planned[0].latitude_deg, planned[0].longitude_deg, 0.0)
+    wanted_m, taken_m = _plane(planned, frame), _plane(fixes, frame)
+    usual_m = float(np.median(np.linalg.norm(np.diff(wanted_m, axis=0), axis=1)))
+    nearest_m = np.min(np.linalg.norm(wanted_m[:, None] - taken_m[None], axis=2), axis=1)
+    missed = [planned[n].name or str(n + 1) for n in np.flatnonzero(nearest_m > TAKEN_SHARE * usual_m).tolist()]
+    if not missed:
+        return (f"{counted}; a still lies near each planned station",)
+    named = ", ".join(missed[:MOST_NAMED]) + (", ..." if len(missed) > MOST_NAMED else "")
+    return (f"{counted}; no still lies near {len(missed)} planned stations: {named}",)
+
+
+def _plane(fixes: Sequence[GnssFix], frame: LocalFrame) -> Array:
+    latitude, longitude = np.array([[fix.latitude_deg, fix.longitude_deg] for fix in fixes]).T
+    return np.asarray(frame.enu_from_geographic(latitude, longitude, np.zeros(len(fixes)))[:, :2])
