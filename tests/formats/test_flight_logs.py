@@ -47,7 +47,7 @@ def test_all_logs_of_a_flight_tell_the_same_exposures(name: str) -> None:
     assert np.abs(one.exposure_table.latitude_deg - two.exposure_table.latitude_deg).max() <= 1.01e-7
     assert np.abs(one.exposure_table.longitude_deg - two.exposure_table.longitude_deg).max() <= 1.01e-7
     apart_s = (one.exposure_table.when.gps_ns - two.exposure_table.when.gps_ns) * 1e-9
-    assert np.abs(apart_s).max() < 0.03
+    assert np.abs(apart_s).max() < 0.015
 
 
 def test_two_logs_read_at_once_are_read_as_alone() -> None:

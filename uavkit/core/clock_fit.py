@@ -14,7 +14,7 @@ FAR_S = 1.0
 LEAST_IN_SEGMENT = 20
 WINDOW = 15
 """Pairs over which residuals are smoothed before they are taken for a bend."""
-BEND_S = 0.02
+BEND_S = 0.005
 """A line that smoothed residuals leave by more than this, and by more than four times their own sigma, is split."""
 MOST_SEGMENTS = 256
 _ROUNDS = 20
