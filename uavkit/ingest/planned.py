@@ -12,7 +12,7 @@ from uavkit.ingest.positions import JoinedPositions, PositionOptions, join_posit
 
 PLANNED_SIGMA_M = 5.0
 """Of a planned position as that of the still: vehicles cut corners and trigger late."""
-TAKEN_SHARE = 0.75
+TAKEN_SHARE = 0.6
 """A station counts as taken if a still lies nearer than this share of the usual distance between stations."""
 MOST_NAMED = 12
 

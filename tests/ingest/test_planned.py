@@ -1,0 +1,77 @@
+"""A plan against what was taken: stations without a still are named; planned places stand in where no others are."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from uavkit.core.errors import InputError
+from uavkit.core.frames import LocalFrame
+from uavkit.core.heights import HeightDatum
+from uavkit.core.records import GnssFix, StillInfo
+from uavkit.ingest.planned import PLANNED_SIGMA_M, join_planned, planned_notes
+from uavkit.ingest.positions import JoinedPositions, PositionOptions
+from uavkit.plan.expected import expected_positions
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def fixes(enu_m: np.ndarray, word: str = "station") -> list[GnssFix]:
+    place = LocalFrame.at(35.8, 139.65, 0.0).geographic_from_enu(np.column_stack([enu_m, np.zeros(len(enu_m))]))
+    return [
+        GnssFix(
+            gps_time_ns=None, latitude_deg=a, longitude_deg=b, height_m=float("nan"),
+            height_datum=HeightDatum.GROUND, name=f"{word} {n}",
+        )
+        for n, (a, b, _) in enumerate(place)
+    ]  # fmt: skip
+
+
+def strips(count: int = 24) -> np.ndarray:
+    """Strips of eight stations, 10 m apart, flown to and fro at 25 m."""
+    n = np.arange(count)
+    along = np.where(n // 8 % 2 == 0, n % 8, 7 - n % 8) * 10.0
+    return np.column_stack([along, n // 8 * 25.0])
+
+
+def joined(given: list[GnssFix | None]) -> JoinedPositions:
+    return JoinedPositions(fixes=tuple(given), probability=np.ones(len(given)), from_exif=False, discarded=(), notes=())
+
+
+def test_stations_without_a_still_are_named() -> None:
+    planned, rng = strips(), np.random.default_rng(3)
+    taken = np.delete(planned + rng.normal(0.0, 1.0, planned.shape), [5, 17], axis=0)
+    (note,) = planned_notes(fixes(planned), joined([*fixes(taken, "still"), None]))
+    assert "24 exposures, there are 23 stills" in note
+    assert "near 2 planned stations: station 5, station 17" in note
+    (whole,) = planned_notes(fixes(planned), joined(list(fixes(planned + 0.5))))
+    assert "near each planned station" in whole
+
+
+def test_without_positions_only_the_numbers_are_told() -> None:
+    assert planned_notes(fixes(strips()), joined([None] * 20)) == ("the plan has 24 exposures, there are 20 stills",)
+
+
+def test_planned_places_stand_in_with_a_sigma_of_their_own() -> None:
+    planned = fixes(strips())
+    infos = [
+        StillInfo(name=f"R{n:03d}.JPG", width_px=10, height_px=10, camera_time_ns=10**18 + n * 3 * 10**9)
+        for n in range(24)
+    ]
+    result = join_planned(infos, planned, (), PositionOptions())
+    assert result.count == 24
+    assert [fix.latitude_deg for fix in result.fixes if fix] == [fix.latitude_deg for fix in planned]
+    assert {fix.sigma_horizontal_m for fix in result.fixes if fix} == {PLANNED_SIGMA_M}
+    assert "those of the plan" in result.notes[0]
+
+
+def test_plans_of_all_kinds_tell_their_exposures(tmp_path: Path) -> None:
+    mission = expected_positions(ROOT / "sim_logs" / "sitl_waypoint_trigger" / "mission.waypoints")
+    assert len(mission) == 33
+    assert mission[0].latitude_deg == pytest.approx(35.8, abs=0.01)
+    ours = sorted((ROOT / "flightplans").glob("*.plan"))
+    assert all(len(expected_positions(path)) > 3 for path in ours[:2])
+    other = tmp_path / "plan.doc"
+    other.write_text("plan")
+    with pytest.raises(InputError, match="a plan is"):
+        expected_positions(other)
