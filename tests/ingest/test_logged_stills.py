@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from uavkit.core.block import StillInVideo, VideoSync
 from uavkit.core.errors import InputError
 from uavkit.core.exposures import StillState
 from uavkit.core.flight_log import FlightLog, fix_table, no_attitudes, no_exposures, no_fixes
 from uavkit.core.frames import LocalFrame
 from uavkit.core.progress import silent
-from uavkit.core.records import StillInfo
+from uavkit.core.records import FieldOrder, StillInfo
+from uavkit.core.video import AffineTransformation
 from uavkit.formats.flight_logs import open_log
 from uavkit.formats.match_file import MatchRow, read_matches, write_matches
 from uavkit.ingest.log_positions import LogOptions
@@ -170,6 +172,33 @@ def test_the_lever_arm_turns_with_the_vehicle(logs: dict[str, FlightLog]) -> Non
     along_m = np.sum(moved * nose, axis=1)
     assert along_m[np.isfinite(along_m)] == pytest.approx(-0.5, abs=0.02)
     assert arm.lever_arm_taken_off
+
+
+def test_shutters_in_the_video_tell_what_whole_seconds_leave_open(logs: dict[str, FlightLog]) -> None:
+    """The video's times are good to a field: each still has its exposure, also without any EXIF time."""
+    log, first_ns = logs["distance"], int(logs["distance"].exposure_table.when.gps_ns[0])
+    stills = camera(log, unit_ns=1_000_000_000)
+    places = tuple(
+        StillInVideo(
+            still=still.name,
+            last_frame=n,
+            first_frame=n + 1,
+            exposure_time_ns=(gps_ns - first_ns + 5_000_000_000) // 16_683_350 * 16_683_350 + 8_341_675,
+            kind="content" if n == 7 else "black",
+            confidence=0.99,
+        )
+        for n, (still, gps_ns) in enumerate(zip(stills, log.exposure_table.when.gps_ns.tolist(), strict=True))
+    )
+    video = VideoSync(
+        places=places,
+        still_from_video=AffineTransformation(matrix=np.eye(2), shift=np.zeros(2)),
+        residual_px=0.1,
+        field_order=FieldOrder.BOTTOM_FIRST,
+        frame_interval_ns=33_366_700,
+    )
+    for infos in (stills, [replace(still, camera_time_ns=None) for still in stills]):
+        result = stills_in_logs(infos, [log], GivenMatches(), LogOptions(), silent, video)
+        assert_right(result, range(1, 32))
 
 
 def test_what_the_user_gives_counts_and_is_checked(logs: dict[str, FlightLog], tmp_path: Path) -> None:

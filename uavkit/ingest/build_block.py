@@ -110,7 +110,7 @@ def build_block(
         notes += (f"{len(missing)} stills cannot be read and are left out: {_reasons(missing)}",)
     notes += check_overlap(stills, prepared.pictures, sources.video)
     sync, sync_notes = _video(sources.video, stills, prepared, options, progress)
-    logged = stills_in_logs(stills, sources.logs, sources.given, options.logs, progress)
+    logged = stills_in_logs(stills, sources.logs, sources.given, options.logs, progress, sync)
     joined = _positions(sources, stills, tuple(missing), logged, options)
     control = _marked(sources.control, stills, tuple(missing))
     check = _marked(sources.check, stills, tuple(missing))

@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeGuard
 
 import numpy as np
 
+from uavkit.core.block import VideoSync
 from uavkit.core.exposures import CameraClock, ExposureMatches, StillExposure, StillState, UnusedEvent
 from uavkit.core.flight_log import FlightLog
 from uavkit.core.gpstime import NO_TIME
@@ -25,6 +27,8 @@ from uavkit.ingest.log_positions import (
 from uavkit.ingest.match_overrides import apply_overrides
 from uavkit.ingest.positions import JoinedPositions, PositionOptions
 
+LEAST_SHOWN, SHARE_SHOWN = 5, 0.8
+"""So many stills, and so much of all, must show their shutter in the video for its times to be used."""
 BY_HAND = "by hand"
 MOST_NAMED = 20
 """Stills or events named in a note; the table has them all."""
@@ -58,9 +62,11 @@ def stills_in_logs(
     given: GivenMatches,
     options: LogOptions,
     progress: Progress,
+    video: VideoSync | None = None,
 ) -> LoggedStills:
     """Match the stills with the exposures of logs, and place them by the logs' fixes at these times.
 
+    Where the shutters of most stills show in the video, their times there take the place of EXIF's, which are coarser.
     Raises InputError where what is given by hand names no still or no exposure.
     """
     flights = prepare_flights(logs)
@@ -70,7 +76,7 @@ def stills_in_logs(
         if logs:
             notes.append("no log tells of exposures with times: the stills cannot be matched with the logs by time")
         return LoggedStills(matches=None, joined=_nothing(len(infos)), notes=tuple(notes), lever_arm_taken_off=False)
-    stamps = _still_stamps(infos)
+    stamps = _video_stamps(infos, video) if _tells_times(video, len(infos)) else _still_stamps(infos)
     found = match_exposures(stamps, merged.stamps, progress=progress)
     if given.rows:
         found = apply_overrides(found, stamps.name, merged.stamps, given.rows, given.source)
@@ -119,6 +125,31 @@ def _still_stamps(infos: Sequence[StillInfo]) -> StillStamps:
         name=tuple(info.name for info in infos),
         time_ns=np.array(times, dtype=np.int64),
         resolution_ns=np.array([info.camera_time_resolution_ns for info in infos], dtype=np.int64),
+    )
+
+
+def _tells_times(video: VideoSync | None, stills: int) -> TypeGuard[VideoSync]:
+    shown = 0 if video is None else sum(place.kind != "content" for place in video.places)
+    return shown >= max(LEAST_SHOWN, SHARE_SHOWN * stills)
+
+
+def _video_stamps(infos: Sequence[StillInfo], video: VideoSync) -> StillStamps:
+    """Return the times at which the shutters show in the video, on the camera's clock as far as EXIF tells it.
+
+    Each is good to the field in which the picture went. Stills whose shutter does not show have no time.
+    """
+    field_ns = video.frame_interval_ns // 2
+    shown = {p.still: p.exposure_time_ns - field_ns // 2 for p in video.places if p.kind != "content"}
+    apart = [
+        info.camera_time_ns + info.camera_time_resolution_ns // 2 - shown[info.name]
+        for info in infos
+        if info.camera_time_ns is not None and info.name in shown
+    ]
+    zero_ns = int(np.median(apart)) if apart else 0
+    return StillStamps(
+        name=tuple(info.name for info in infos),
+        time_ns=np.array([zero_ns + shown.get(info.name, NO_TIME - zero_ns) for info in infos], dtype=np.int64),
+        resolution_ns=np.full(len(infos), field_ns, dtype=np.int64),
     )
 
 
