@@ -137,7 +137,9 @@ def test_hardly_a_wrong_pair_with_stamps_of_1_s(hover):
     print(tally.line(f"1 s, {'hover' if hover else 'distance'}"))  # noqa: T201 - shown with -s
     assert tally.wrong <= max(0.001 * tally.given, 3.0), tally.wrong_cases
     assert tally.settled_cases >= (3 if hover else CASES - 4)
-    assert tally.found + tally.found_doubled >= 0.97 * tally.settled_pairs
+    # some pairs no one can tell (two stills within the second of one event): against what can be known at all, see
+    # the comparison with the exhaustive search
+    assert tally.found + tally.found_doubled >= 0.95 * tally.settled_pairs
 
 
 def test_probabilities_are_calibrated():

@@ -65,7 +65,7 @@ class Chain:
     per_still: Array
     """(n, 3): see ``kernels.alignment``."""
     per_event: Array
-    """(m, 4)."""
+    """(m, 5)."""
     tables: Array
     """(3, cells) density of intervals: of two events, of an event and a still, of two stills."""
     grid: Array
@@ -103,7 +103,7 @@ def build_chain(still_s: Array, half_s: Array, event_s: Array, sigma_s: Array, r
         event_s=event_s,
         sigma_s=sigma_s,
         per_still=np.zeros((len(still_s), 3)),
-        per_event=np.zeros((len(event_s), 4)),
+        per_event=np.zeros((len(event_s), 5)),
         tables=np.zeros((3, 1)),
         grid=law.grid,
         weights=np.zeros((5, 5)),
@@ -180,7 +180,11 @@ def _per_still(chain: Chain, tables: Array, rates: Rates) -> Array:
 def _per_event(chain: Chain, tables: Array, rates: Rates) -> Array:
     gap = np.diff(chain.event_s)
     none = rates.event_again * told_again(gap, 0.0) + rates.event_false * told_falsely(gap, chain.interval_s)
-    return _entries(chain.event_s, none, (tables[0], chain.law.shown_by_events()[0]), chain.grid)
+    entries = _entries(chain.event_s, none, (tables[0], chain.law.shown_by_events()[0]), chain.grid)
+    several = np.full(len(chain.event_s), -1.0)
+    if chain.coarse:
+        several[1:] = chain.law.of_several(rates.still_alone, gap)
+    return np.column_stack([entries, several])
 
 
 def rates_seen(chain: Chain, alone: tuple[Array, Array], none: tuple[Array, Array]) -> Rates:

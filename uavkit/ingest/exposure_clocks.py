@@ -16,6 +16,8 @@ from uavkit.ingest.exposure_sums import Clock, Pairs, log_sum, pairs_of
 
 MOST_WINDOWS = 400
 MOST_STARTS = 250
+MOST_IMPROVED = (80, 60, 45, 30)
+"""Settings kept at most, from round to round of improvement."""
 FEWER_SHARE = 0.25
 """Windows that hold so many fewer pairs than the best are not looked at."""
 FEWER_AT_LEAST = 10.0
@@ -47,18 +49,18 @@ def best_clocks(chain: Chain, limits: ClockLimits) -> list[WeighedClock]:
     """Return the settings that may matter, the best first, each by least squares; none where nothing fits."""
     blur = _vote_step(chain)
     pairs = min(len(chain.still_s), len(chain.event_s))
-    found = _nearly_best(
-        [WeighedClock(clock=c, log_sum=log_sum(chain, c, blur)) for c in _starts(chain, limits)], 0.3 * pairs
-    )
-    for blur_s, each in ((blur, 0.2), (0.5 * blur, 0.12), (0.0, 0.08), (0.0, 0.05)):
-        found = _nearly_best([_improved(chain, entry.clock, blur_s, limits) for entry in found], each * pairs)
-        found = _without_doubles(chain, found)
+    starts = _without_doubles(chain, [WeighedClock(clock=clock, log_sum=0.0) for clock in _starts(chain, limits)])
+    found = [WeighedClock(clock=start.clock, log_sum=log_sum(chain, start.clock, blur)) for start in starts]
+    found = _nearly_best(found, 0.3 * pairs, MOST_IMPROVED[0])
+    for blur_s, each, most in zip((blur, 0.5 * blur, 0.0), (0.2, 0.12, 0.06), MOST_IMPROVED[1:], strict=True):
+        found = [_improved(chain, entry.clock, blur_s, limits) for entry in found]
+        found = _without_doubles(chain, _nearly_best(found, each * pairs, most))
     return found
 
 
-def _nearly_best(found: list[WeighedClock], margin: float) -> list[WeighedClock]:
+def _nearly_best(found: list[WeighedClock], margin: float, most: int) -> list[WeighedClock]:
     """Return the best, first, and those that may yet be as good: improvement may gain them ``margin``."""
-    order = sorted(found, key=lambda entry: -entry.log_sum)
+    order = sorted(found, key=lambda entry: -entry.log_sum)[:most]
     return [entry for entry in order if entry.log_sum > order[0].log_sum - NEAR_BEST - margin]
 
 
@@ -99,7 +101,25 @@ def _starts(chain: Chain, limits: ClockLimits) -> Iterator[Clock]:
         found += _peaks(chain, (low, high), drifts, (step, noise))
     found.sort(key=lambda entry: -entry[0])
     for _, offset, drift in found[:MOST_STARTS]:
-        yield Clock(offset_s=offset, drift=drift, reference_s=_middle(chain))
+        yield _fitted_to_nearest(chain, Clock(offset_s=offset, drift=drift, reference_s=_middle(chain)), noise, limits)
+
+
+def _fitted_to_nearest(chain: Chain, clock: Clock, noise_s: float, limits: ClockLimits) -> Clock:
+    """Return the clock by least squares over each still and the event nearest to it, those that do not fit left out.
+
+    The grid of drifts is coarse: without this a wrong shift that it happens to meet looks better than the true one.
+    """
+    for _ in range(3):
+        moved = clock.event_time_s(chain.still_s)
+        after = np.clip(np.searchsorted(chain.event_s, moved), 1, max(len(chain.event_s) - 1, 1))
+        after = np.minimum(after, len(chain.event_s) - 1)
+        before = np.maximum(after - 1, 0)
+        nearest = np.where(moved - chain.event_s[before] < chain.event_s[after] - moved, before, after)
+        fits = np.flatnonzero(np.abs(moved - chain.event_s[nearest]) < chain.half_s + noise_s)
+        if len(fits) < 2:
+            break
+        clock, _ = fitted_with_covariance(chain, (fits, nearest[fits], np.ones(len(fits))), limits)
+    return clock
 
 
 def _windows(chain: Chain, limits: ClockLimits) -> list[tuple[float, float]]:

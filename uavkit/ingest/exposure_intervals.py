@@ -17,6 +17,9 @@ BROAD_SHARE = 0.15
 AGAIN_WITHIN_S = 0.33
 MOST_CELLS = 60_000
 FINEST_S = 1e-3
+MISSING_AT_LEAST = 0.05
+"""Taken for the share missed when the own law is worked out: what is left of gaps that are the sequences' own would
+make their meeting too likely; what is taken too much does no harm."""
 ENOUGH_EVENTS = 12
 """With so many events, coarse stamps of stills have no say in the law."""
 
@@ -53,9 +56,23 @@ class IntervalLaw:
         law = np.zeros(len(self.event_counts))
         for shown, p, share, widths in zip(counts, missing, shares, self.widths_s, strict=True):
             if share > 0.0:
-                law += share * self._smoothed(shown, p, widths)
+                law += share * self._smoothed(shown, max(p, MISSING_AT_LEAST), widths)
         both = events_missing * stills_missing
         return self._blurred((1.0 - both) * law + both * _sum_of_two(law, self.step_s))
+
+    def of_several(self, events_missing: float, interval_s: Array) -> Array:
+        """Return the density of an exposure so long (any shape) after another with one or more between the two."""
+        k = len(self.event_counts)
+        law = self._smoothed(self.event_counts, events_missing, self.widths_s[0])
+        one = np.fft.rfft(law, 2 * k) * self.step_s
+        total, power = np.zeros(k), np.asarray(one)
+        for _ in range(int(k * self.step_s / self.median_s) + 1):
+            power = one * np.fft.rfft(np.fft.irfft(power, 2 * k)[:k], 2 * k)
+            total += np.fft.irfft(power, 2 * k)[:k]
+        cells = np.asarray(interval_s) / self.step_s
+        inside = np.interp(cells, np.arange(k), np.maximum(total / self.step_s, 0.0))
+        usual = BROAD_SHARE / self.median_s
+        return np.asarray(np.where(cells < k - 1, (1.0 - BROAD_SHARE) * inside + usual, 1.0 / self.median_s))
 
     def shown_by_events(self) -> Array:
         """Return (3, cells) the density of the intervals that the events show, gaps and all, as above."""

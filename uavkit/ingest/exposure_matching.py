@@ -28,7 +28,10 @@ LEAST_PROBABLE = 0.05
 """A partner less probable than this is not worth naming."""
 LEAST_LEFT = 6
 """So many stills and events must be left for another clock setting to be looked for."""
-MOST_RUNS = 12
+LEAST_PAUSE_S = 60.0
+PAUSE_INTERVALS = 10.0
+"""A pause so long is one between sorties: the camera's clock may have been set anew."""
+MOST_RUNS = 16
 
 
 class StillState(Enum):
@@ -167,7 +170,7 @@ class _Work:
         self._event_state = [EventState.NO_TIME if bad else EventState.NO_STILL for bad in lost]
         self._event_reason = ["its log tells no GPS time" if bad else "no still is left for it" for bad in lost]
         self._clocks: list[CameraClock] = []
-        self._notes: list[str] = []
+        self._notes: list[list[str]] = []
 
     def match(self, shots: Shots) -> list[Shots]:
         """Match one run with the events not used yet; return those of its stills that another setting may explain."""
@@ -179,17 +182,19 @@ class _Work:
             return []
         clock = run.clock(found)
         self._take(run, found, clock)
-        return self._left(shots, clock)
+        return self._left(shots) if clock.settled else _at_longest_pause(shots)
 
     def match_what_is_left(self, shots: Shots) -> list[Shots]:
         """Match stills that another setting of the clock left alone; what does not settle stays as it was."""
         run = self._run(shots)
         found = None if run is None else run.posterior(None)
-        if run is None or found is None or not run.clock(found).settled:
+        if run is None or found is None:
             return []
+        if not run.clock(found).settled:
+            return _at_longest_pause(shots)
         clock = run.clock(found)
         self._take(run, found, clock)
-        return self._left(shots, clock)
+        return self._left(shots)
 
     def _run(self, shots: Shots) -> "_Run | None":
         unused = (EventState.NO_STILL, EventState.AMBIGUOUS)
@@ -206,10 +211,8 @@ class _Work:
             return None
         return min(known, key=lambda clock: abs(int(clock.gps_ns(shots.low_ns[:1])[0]) - clock.reference_gps_ns))
 
-    def _left(self, shots: Shots, clock: CameraClock) -> list[Shots]:
+    def _left(self, shots: Shots) -> list[Shots]:
         """Return the stills of a settled run that no event explains, where they are many together."""
-        if not clock.settled:
-            return []
         begin, end = _longest_run(np.array([self._state[row] is StillState.NO_EVENT for row in shots.rows]))
         if end - begin < LEAST_LEFT:
             return []
@@ -228,13 +231,17 @@ class _Work:
             if self._event_state[event] is not EventState.MATCHED:
                 self._event_state[event], self._event_reason[event] = state, reason
         self._clocks.append(run.measured(clock, used, self._event))
-        self._notes += run.notes(self._clocks[-1], found)
+        self._notes.append(run.notes(self._clocks[-1], found))
 
     def result(self) -> ExposureMatching:
         """Return all that was found."""
-        notes = list(dict.fromkeys(self._notes))
-        if len([clock for clock in self._clocks if clock.settled]) > 1:
-            notes.append(f"the camera's clock was set anew: {len(self._clocks)} settings, each matched on its own")
+        settled = [clock for clock in self._clocks if clock.settled]
+        found = {int(row) for clock in settled for row in clock.stills}
+        kept = [k for k, c in enumerate(self._clocks) if c.settled or not found.issuperset(c.stills.tolist())]
+        clocks = tuple(self._clocks[k] for k in kept)
+        notes = list(dict.fromkeys(note for k in kept for note in self._notes[k]))
+        if len(settled) > 1:
+            notes.append(f"the camera's clock was set anew: {len(settled)} settings, each matched on its own")
         return ExposureMatching(
             event=self._event,
             probability=self._probability,
@@ -243,13 +250,25 @@ class _Work:
             spread_s=self._spread_s,
             event_state=tuple(self._event_state),
             event_reason=tuple(self._event_reason),
-            clocks=tuple(self._clocks),
+            clocks=clocks,
             notes=tuple(notes),
         )
 
 
 def _seconds(time_ns: Indices) -> Array:
     return np.asarray(time_ns * 1e-9, dtype=np.float64)
+
+
+def _at_longest_pause(shots: Shots) -> list[Shots]:
+    """Return the stills before and after a pause between two sorties, none where there is no such pause."""
+    gap_s = _seconds(np.diff(shots.low_ns))
+    if len(gap_s) < 2 * LEAST_LEFT:
+        return []
+    if float(gap_s.max()) < max(LEAST_PAUSE_S, PAUSE_INTERVALS * float(np.median(gap_s))):
+        return []
+    cut = int(np.argmax(gap_s)) + 1
+    parts = (slice(0, cut), slice(cut, len(shots.rows)))
+    return [Shots(rows=shots.rows[p], low_ns=shots.low_ns[p], width_ns=shots.width_ns[p]) for p in parts]
 
 
 def _longest_run(flags: "np.typing.NDArray[np.bool_]") -> tuple[int, int]:
@@ -335,16 +354,25 @@ class _Run:
 
     def decisions(self, found: Posterior, settled: bool) -> list[_Decision]:
         """Return what becomes of each still."""
-        n, wanted = len(self._shots.rows), self._options.wanted_probability
-        offers = [self._offer(k, found) for k in range(n)]
-        level = wanted
-        if self.chain.coarse:
-            probable = np.sort([o.probability for o in offers if o.probability >= self._options.coarse_probability])
-            mean_wrong = np.cumsum(1.0 - probable[::-1]) / np.arange(1, len(probable) + 1)
-            good = np.flatnonzero(mean_wrong <= 1.0 - wanted)
-            level = min(wanted, float(probable[::-1][good[-1]])) if len(good) else wanted
-        claims = np.bincount([o.event for o in offers if o.probability >= level], minlength=len(self._events.label))
-        return [self._decided(o, level if settled else 2.0, bool(claims[o.event] > 1)) for o in offers]
+        offers = [self._offer(k, found) for k in range(len(self._shots.rows))]
+        level = self._level(np.array([o.probability for o in offers]), float(found.modes[0])) if settled else 2.0
+        taken = [o.event for o in offers if o.probability >= level]
+        contested = {event for event in taken if taken.count(event) > 1} if len(set(taken)) < len(taken) else set()
+        return [self._decided(o, level, o.event in contested) for o in offers]
+
+    def _level(self, probability: Array, shift: float) -> float:
+        """Return how probable (n,) pairs must be; that of the shift is judged by itself, and taken off here.
+
+        Of coarse stamps the mean of all that are taken must be as probable as wanted: each alone is open to the chance
+        that two entries that miss their partners fall into the same second.
+        """
+        wanted = self._options.wanted_probability
+        if not self.chain.coarse:
+            return wanted * shift
+        given = np.sort(probability / shift)[::-1]
+        given = given[given >= self._options.coarse_probability]
+        good = np.flatnonzero(np.cumsum(1.0 - given) <= (1.0 - wanted) * np.arange(1, len(given) + 1))
+        return shift * (min(wanted, float(given[good[-1]])) if len(good) else wanted)
 
     def _offer(self, k: int, found: Posterior) -> _Decision:
         """Return the best event of still k, taken together with those that may tell the same exposure."""
@@ -364,7 +392,7 @@ class _Run:
         near = np.abs(self.chain.event_s[event] - self.chain.event_s[event[best]]) < AGAIN_WITHIN_S
         near &= probability >= min(1e-4, float(probability[best]))
         time, weight = self.chain.event_s[event[near]], probability[near]
-        alone = float(probability[best]) >= self._options.wanted_probability
+        alone = float(probability[best]) >= self._options.wanted_probability * float(found.modes[0])
         spread = 0.0 if alone else float(np.ptp(time))
         shown = [j for j in np.argsort(-probability).tolist() if probability[j] > LEAST_PROBABLE]
         names = " or ".join(f"{self._label(int(event[j]))} ({probability[j]:.3f})" for j in shown)

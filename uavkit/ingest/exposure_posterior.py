@@ -22,9 +22,14 @@ NEGLIGIBLE = 9.0
 NO_RELATION = 0.05
 """Probability a priori that the events are not those of the stills."""
 LOG_NO_RELATION = float(np.log(NO_RELATION / (1.0 - NO_RELATION)))
-LOG_HOPELESS = float(np.log(0.9))
+HOPELESS = 0.9
 """A shift less probable than this is of no use."""
 SHARE_TO_GO_ON = 0.5
+SHIFT_TRUST = 0.75
+"""Odds between shifts, and against no relation, are taken to this power: that the law of intervals and the rates of
+defects are estimates is an error that all pairs of a shift have in common."""
+LEAST_SHARE, LEAST_SHARE_IF_OPEN = 1e-5, 0.02
+"""Settings less probable are left out of the pairs' probabilities; where all is open these only serve to tell why."""
 MOST_SETTINGS = 1500
 
 
@@ -96,8 +101,7 @@ def _at_their_best(chain: Chain, modes: list[WeighedClock], limits: ClockLimits)
 
 def _open_already(regions: list[_Region]) -> bool:
     """Tell whether no region can be the only one any more: then the others need not be looked at."""
-    log_sums = np.array([float(np.logaddexp.reduce(region.log_weights)) for region in regions])
-    return float(log_sums.max()) < float(np.logaddexp.reduce(np.append(log_sums, LOG_NO_RELATION))) + LOG_HOPELESS
+    return bool(_shares(regions)[:-1].max() < HOPELESS)
 
 
 class _Grid:
@@ -166,18 +170,26 @@ class _Grid:
         return float(np.log(max(share, 1e-12)) + np.log(self._step_s / max(high - low, self._step_s)))
 
 
+def _shares(regions: list[_Region]) -> Array:
+    """Return the probability of each region, and of no relation (the last)."""
+    logs = np.array([float(np.logaddexp.reduce(region.log_weights)) for region in regions] + [LOG_NO_RELATION])
+    weights = np.exp(SHIFT_TRUST * (logs - logs.max()))
+    return np.asarray(weights / weights.sum(), dtype=np.float64)
+
+
 def _summed(chain: Chain, regions: list[_Region], limits: ClockLimits) -> Posterior:
     """Return the mean over all settings by their weights."""
     n, m = len(chain.still_s), len(chain.event_s)
-    top = max(float(region.log_weights.max()) for region in regions)
+    shares = _shares(regions)
+    least = LEAST_SHARE if float(shares[:-1].max()) > HOPELESS else LEAST_SHARE_IF_OPEN
     keys, values = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
-    again, copy, totals = np.zeros(m), np.zeros(n), []
+    again, copy = np.zeros(m), np.zeros(n)
     best: tuple[float, Pairs | None] = (-np.inf, None)
-    for region in regions:
-        weights = np.exp(region.log_weights - top)
-        totals.append(float(weights.sum()))
+    for region, share in zip(regions, shares[:-1].tolist(), strict=True):
+        weights = np.exp(region.log_weights - region.log_weights.max())
+        weights *= share / weights.sum()
         for clock, weight in zip(region.clocks, weights.tolist(), strict=True):
-            if weight < np.exp(-NEGLIGIBLE):
+            if weight < least:
                 continue
             pairs = pairs_of(chain, clock, region.blur_s)
             keys.append(pairs.still * m + pairs.event)
@@ -186,19 +198,17 @@ def _summed(chain: Chain, regions: list[_Region], limits: ClockLimits) -> Poster
             copy += weight * pairs.copy
             if weight > best[0]:
                 best = (weight, pairs)
-    nothing = float(np.exp(min(LOG_NO_RELATION - top, 700.0)))
-    total = sum(totals) + nothing
     key, inverse = np.unique(np.concatenate(keys), return_inverse=True)
-    probability = np.bincount(inverse, weights=np.concatenate(values), minlength=len(key)) / total
+    total = np.bincount(inverse, weights=np.concatenate(values), minlength=len(key))
     clock, sigma_offset, sigma_drift = _clock(chain, regions, best[1], limits)
     return Posterior(
         still=key // m,
         event=key % m,
-        probability=probability,
-        again=again / total,
-        copy=copy / total,
-        unrelated=nothing / total,
-        modes=np.sort(np.array(totals))[::-1] / total,
+        probability=np.asarray(total, dtype=np.float64),
+        again=again,
+        copy=copy,
+        unrelated=float(shares[-1]),
+        modes=np.sort(shares[:-1])[::-1],
         clock=clock,
         sigma_offset_s=sigma_offset,
         sigma_drift=sigma_drift,

@@ -14,6 +14,7 @@ from uavkit.core.gpstime import NO_TIME
 SAME_SHUTTER_S = 0.1
 """Events of two logs so near, after the constant lag between the logs is taken off, tell the same exposure."""
 GREATEST_LAG_S = 1.0
+LEAST_FOR_LAG = 3
 FILE_NUMBERS_TELL = 0.02
 """Times that run backwards by file number at more than this share: the numbers tell nothing of the order."""
 WHOLE_UNITS_NS = (1_000_000_000, 100_000_000, 10_000_000, 1_000_000)
@@ -70,7 +71,8 @@ def merge_exposures(logs: Sequence[ExposureStamps], log_names: Sequence[str]) ->
     """Return the exposures of all logs, each once: where logs tell the same one, the log named first counts.
 
     Another log's events may lag by a constant (a report follows the trigger): the lag is the median over the nearest
-    events, and events are the same where they differ from it by less than ``SAME_SHUTTER_S``.
+    events, and events are the same where they differ from it by less than ``SAME_SHUTTER_S``. What the other log alone
+    tells is moved by the lag.
     """
     time = np.zeros(0, dtype=np.int64)
     log, row, notes = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), []
@@ -82,6 +84,7 @@ def merge_exposures(logs: Sequence[ExposureStamps], log_names: Sequence[str]) ->
         if np.any(same):
             told = f"{int(same.sum())} of {len(new)} exposures of {log_names[number]} are told by another log already"
             notes.append(told + (f", {lag_s:+.3f} s apart" if abs(lag_s) >= 0.001 else ""))
+            new = new - (round(lag_s * 1e9) if int(same.sum()) >= LEAST_FOR_LAG else 0)
         time = np.concatenate([time, new[~same]])
         log = np.concatenate([log, np.full(int(np.sum(~same)), number, dtype=np.int64)])
         row = np.concatenate([row, known[~same]])

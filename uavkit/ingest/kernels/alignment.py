@@ -93,12 +93,16 @@ def _moves(
     """Give the weights of the five steps from a state: to PAIR, ALONE, EVENT, AGAIN, COPY.
 
     ``per_still`` (n, 3): 1 / density if unrelated, density of the interval before, weight as a copy. ``per_event``
-    (m, 4): the same, and the density of the interval over two events. ``steps`` (4,) of the state.
+    (m, 5): the same, the density of the interval over two events, and that of any number of exposures between this
+    event and the one before (-1 to leave it aside): a coarse stamp between them tells less. ``steps`` (4,) of the
+    state.
     """
     n, m = len(per_still), len(per_event)
     to_event = to_still = 0.0
     if kind == ALONE:
         to_event = steps[1]
+        if 0 < j < m and per_event[j, 4] >= 0.0:
+            to_event = 0.5 * (to_event + per_event[j, 4])
         to_still = per_still[i, 1] if i < n else 0.0
     elif kind == AGAIN and j > 1:
         to_event = per_event[j, 3] if j < m else 0.0
