@@ -36,6 +36,9 @@ MOST_HEIGHT_M = 100_000.0
 """Heights beyond are damage."""
 MOST_SPEED_M_S = 1000.0
 """Velocities beyond are damage."""
+ABOVE_NOISE = 6.0
+"""Ways are judged that are longer than so many times the misfit of single intervals: noise of positions is none of
+velocities."""
 LEAST_SPEED_M_S = 0.5
 """Slower than this, velocities are not judged."""
 
@@ -391,7 +394,10 @@ def _misfit(h: Array, joined: Flags, position: Array, velocity: Array) -> float:
     bad = np.concatenate([[0], np.cumsum(~good)])
     way = position[last] - position[first]
     length = np.linalg.norm(way, axis=1)
+    apart = np.linalg.norm((np.diff(position, axis=0) - step)[good], axis=1)
+    noise = float(np.median(apart)) if len(apart) else 0.0
     judged = (bad[last] == bad[first]) & (length > LEAST_SPEED_M_S * (seconds[last] - seconds)) & (last > first)
+    judged &= length > ABOVE_NOISE * noise
     if not judged.any():
         return 0.0
     off = np.linalg.norm(way - flown[last] + flown[first], axis=1)
