@@ -289,7 +289,7 @@ def nmea_cut_lines() -> Broken:
     without_gga, without_both = range(3, 60, 10), range(5, 60, 20)
     parts, lost = list[bytes](), 0
     for second in range(60):
-        for kind, line in enumerate(_nmea_epoch(second)):
+        for kind, line in enumerate(nmea_epoch(second)):
             cut = second in without_both or (kind == 0 and second in without_gga)
             parts.append(line[:25] if cut else line)
             lost += 25 if cut else 0
@@ -302,7 +302,7 @@ def nmea_cut_lines() -> Broken:
     )
 
 
-def _nmea_epoch(second: int) -> tuple[bytes, bytes]:
+def nmea_epoch(second: int) -> tuple[bytes, bytes]:
     utc = _utc(TOW_MS + second * 1000)
     clock, day = utc.strftime("%H%M%S.00"), utc.strftime("%d%m%y")
     place = f"3536.{second:04d}0,N,13940.12000,E"
@@ -310,7 +310,7 @@ def _nmea_epoch(second: int) -> tuple[bytes, bytes]:
     return gga, gnss.nmea(f"GPRMC,{clock},A,{place},2.10,10.00,{day},,,A")
 
 
-def _places(number: int = 33) -> list[tuple[float, float]]:
+def places(number: int = 33) -> list[tuple[float, float]]:
     return [(round(35.8 + index * 1e-4, 6), round(139.65 + index % 3 * 1e-4, 6)) for index in range(number)]
 
 
@@ -322,25 +322,25 @@ def _kml(marks: list[str], prologue: str = "") -> bytes:
     )
 
 
-def _mark(name: str, first: float, second: float) -> str:
+def mark(name: str, first: float, second: float) -> str:
     point = f"<Point><altitudeMode>absolute</altitudeMode><coordinates>{first},{second},60.5</coordinates></Point>"
     return f"<Placemark><name>{name}</name>{point}</Placemark>"
 
 
 def no_times() -> Broken:
-    marks = [_mark(f"W{n}", longitude, latitude) for n, (latitude, longitude) in enumerate(_places(), start=1)]
+    marks = [mark(f"W{n}", longitude, latitude) for n, (latitude, longitude) in enumerate(places(), start=1)]
     return Broken(data=_kml(marks), defect="waypoints without a time, as the Falcon 8 lists them", exposures=33)
 
 
 def latitude_first() -> Broken:
-    marks = [_mark(f"W{n}", latitude, longitude) for n, (latitude, longitude) in enumerate(_places(), start=1)]
+    marks = [mark(f"W{n}", latitude, longitude) for n, (latitude, longitude) in enumerate(places(), start=1)]
     return Broken(data=_kml(marks), defect="latitude before longitude: 139 degrees north", error="is a place")
 
 
 def entity_bomb() -> Broken:
     entities = "".join(f'<!ENTITY e{n} "{f"&e{n - 1};" * 10}">' for n in range(1, 12))
     prologue = f'<!DOCTYPE kml [<!ENTITY e0 "aaaaaaaaaa">{entities}]>\n'
-    data = _kml([_mark("&e11;", 139.65, 35.8)], prologue)
+    data = _kml([mark("&e11;", 139.65, 35.8)], prologue)
     return Broken(data=data, defect="entities that would unfold to a terabyte", error="document type declaration")
 
 
@@ -351,10 +351,10 @@ def zip_bomb() -> Broken:
         entry.compress_type = zipfile.ZIP_BZIP2
         with archive.open(entry, "w", force_zip64=True) as document:
             document.write(b'<?xml version="1.0"?><kml><Document><Placemark><name>')
-            for _ in range(400):
+            for _ in range(300):
                 document.write(b"W" * 1024 * 1024)
             document.write(b"</name></Placemark></Document></kml>")
-    return Broken(data=stream.getvalue(), defect="a few kilobytes that unpack to 400 MB", error="that is no flight")
+    return Broken(data=stream.getvalue(), defect="a few kilobytes that unpack to 300 MB", error="that is no flight")
 
 
 def archive_without_kml() -> Broken:
@@ -364,33 +364,50 @@ def archive_without_kml() -> Broken:
     return Broken(data=stream.getvalue(), defect="a zip archive of other things", error="this is a zip archive")
 
 
-def gpx_cut() -> Broken:
-    head = '<?xml version="1.0"?>\n<gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>\n'
+GPX_HEAD = '<?xml version="1.0"?>\n<gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>\n'
+
+
+def gpx_points() -> list[str]:
     points = []
-    for second, (latitude, longitude) in enumerate(_places(40)):
+    for second, (latitude, longitude) in enumerate(places(40)):
         time = _utc(TOW_MS + second * 1000).strftime("%Y-%m-%dT%H:%M:%SZ")
         points.append(f'<trkpt lat="{latitude}" lon="{longitude}"><ele>36.5</ele><time>{time}</time></trkpt>\n')
-    data = (head + "".join(points[:30]) + points[30][:50]).encode()
+    return points
+
+
+def gpx_cut() -> Broken:
+    points = gpx_points()
+    data = (GPX_HEAD + "".join(points[:30]) + points[30][:50]).encode()
     return Broken(data=data, defect="cut off in a point", fixes=30, lost_bytes=50, first_utc=FIRST_UTC)
 
 
-def srt_cut() -> Broken:
+def srt_parts() -> list[str]:
     parts = []
-    for number, (latitude, longitude) in enumerate(_places(25), start=1):
+    for number, (latitude, longitude) in enumerate(places(25), start=1):
         begin, end = (f"00:00:{number + step:02d},000" for step in (0, 1))
         place = f"[latitude: {latitude}] [longitude: {longitude}] [rel_alt: 15.100 abs_alt: 51.200]"
         text = f"FrameCnt: {number}\n2026-11-22 13:00:{number:02d}.000\n[iso: 100] [fnum: 2.8] {place}\n\n"
         parts.append(f"{number}\n{begin} --> {end}\n{text}")
+    return parts
+
+
+def srt_cut() -> Broken:
+    parts = srt_parts()
     cut = parts[20][: parts[20].index("[longitude")]
     data = ("".join(parts[:20]) + cut).encode()
     return Broken(data=data, defect="cut off between latitude and longitude", fixes=20, lost_bytes=len(cut))
 
 
-def mrk_cut() -> Broken:
+def mrk_lines() -> list[str]:
     lines = []
-    for number, (latitude, longitude) in enumerate(_places(20), start=1):
+    for number, (latitude, longitude) in enumerate(places(20), start=1):
         second, place = 100_018 + 2 * number, f"{latitude:.8f},Lat\t{longitude:.8f},Lon\t75.500,Ellh"
         lines.append(f"{number}\t{second}.250000\t[2400]\t-40,N\t0,E\t86,V\t{place}\t0.010, 0.011, 0.025\t50,Q\n")
+    return lines
+
+
+def mrk_cut() -> Broken:
+    lines = mrk_lines()
     data = ("".join(lines[:14]) + lines[14][:60]).encode()
     utc = _utc(100_020_250).isoformat()[:19]
     defect = "the card was full: the last line is not whole"
@@ -398,7 +415,7 @@ def mrk_cut() -> Broken:
 
 
 def csv_without_mapping() -> Broken:
-    rows = [f"{n},{latitude},{longitude},36.5" for n, (latitude, longitude) in enumerate(_places(20), start=1)]
+    rows = [f"{n},{latitude},{longitude},36.5" for n, (latitude, longitude) in enumerate(places(20), start=1)]
     data = "\n".join(["Photo,Northing,Easting,Alt", *rows, ""]).encode()
     return Broken(data=data, defect="nothing says what its columns are", error="csv_without_mapping.csv.toml")
 
