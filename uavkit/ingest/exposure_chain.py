@@ -131,6 +131,11 @@ def with_rates(chain: Chain, rates: Rates) -> Chain:
     )
 
 
+def with_noise(chain: Chain, factor: float) -> Chain:
+    """Return the same chain with the noise so many times as great."""
+    return chain if factor == 1.0 else replace(chain, sigma_s=factor * chain.sigma_s, noise_s=factor * chain.noise_s)
+
+
 def _weights(rates: Rates) -> Array:
     """Return (5, 5) from PAIR, ALONE, EVENT, AGAIN, COPY to the same."""
     still, event = rates.still_alone, rates.event_alone

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uavkit.core.arrays import Array, Indices
-from uavkit.ingest.exposure_chain import OFFSETS_S, Chain, rates_seen, with_rates
+from uavkit.ingest.exposure_chain import OFFSETS_S, Chain, rates_seen, with_noise, with_rates
 from uavkit.ingest.exposure_clocks import (
     NEAR_BEST,
     ClockLimits,
@@ -19,6 +19,8 @@ from uavkit.ingest.exposure_sums import Clock, Pairs, log_sum, pairs_of
 
 NEGLIGIBLE = 9.0
 """Settings whose logarithm is so much lower than the best are left out of the sum."""
+NOISE_STRENGTH = 10.0
+"""As if the noise a priori came from so many pairs."""
 NO_RELATION = 0.05
 """Probability a priori that the events are not those of the stills."""
 LOG_NO_RELATION = float(np.log(NO_RELATION / (1.0 - NO_RELATION)))
@@ -70,6 +72,7 @@ def posterior(chain: Chain, limits: ClockLimits) -> Posterior | None:
     for _ in range(2):
         seen = pairs_of(chain, modes[0].clock, 0.0)
         chain = with_rates(chain, rates_seen(chain, (seen.still_alone, seen.event_alone), (seen.copy, seen.again)))
+        chain = with_noise(chain, _noise_seen(chain, seen, modes[0].clock))
     regions: list[_Region] = []
     grids: list[_Grid] = []
     for mode in _at_their_best(chain, modes, limits):
@@ -84,6 +87,17 @@ def posterior(chain: Chain, limits: ClockLimits) -> Posterior | None:
         if _open_already(regions):
             break
     return _summed(chain, regions, limits) if regions else None
+
+
+def _noise_seen(chain: Chain, pairs: Pairs, clock: Clock) -> float:
+    """Return the standard deviation of residuals over that expected; 1 for coarse stamps, which do not tell."""
+    if chain.coarse or len(pairs.still) == 0:
+        return 1.0
+    residual_s = clock.event_time_s(chain.still_s[pairs.still]) - chain.event_s[pairs.event]
+    variance = chain.sigma_s[pairs.event] ** 2 + chain.half_s[pairs.still] ** 2 / 3.0
+    square = np.minimum(residual_s**2 / variance, 16.0)
+    total = NOISE_STRENGTH + float(pairs.probability.sum())
+    return float(np.clip(np.sqrt((NOISE_STRENGTH + float(pairs.probability @ square)) / total), 0.3, 3.0))
 
 
 def _at_their_best(chain: Chain, modes: list[WeighedClock], limits: ClockLimits) -> list[WeighedClock]:

@@ -21,6 +21,7 @@ Integers = NDArray[np.int64]
 
 PAIR, ALONE, EVENT, AGAIN, COPY = 0, 1, 2, 3, 4
 KINDS = 5
+LAST_STILLS, LAST_EVENTS = 5, 6
 PARTS = 24
 LEAST = 1e-250
 """Sums smaller than this, of the greatest of their row, count for nothing."""
@@ -90,7 +91,7 @@ def fill_steps(
 def _moves(
     i: int, j: int, kind: int, steps: Floats, per_still: Floats, per_event: Floats, weights: Floats, out: Floats
 ) -> None:
-    """Give the weights of the five steps from a state: to PAIR, ALONE, EVENT, AGAIN, COPY.
+    """Give the weights of the steps from a state: to each kind, and to the first of the stills (events) left at the end.
 
     ``per_still`` (n, 3): 1 / density if unrelated, density of the interval before, weight as a copy. ``per_event``
     (m, 5): the same, the density of the interval over two events, and that of any number of exposures between this
@@ -117,6 +118,10 @@ def _moves(
         out[ALONE] = weights[kind, ALONE] * to_still * per_still[i, 0]
     if 0 < i < n and j < m:
         out[EVENT] = weights[kind, EVENT] * to_event * per_event[j, 0]
+    if i < n:
+        out[LAST_STILLS] = to_still * per_still[i, 0]
+    if j < m:
+        out[LAST_EVENTS] = to_event * per_event[j, 0]
     if j < m and j > 0 and kind != ALONE:
         out[AGAIN] = weights[kind, AGAIN] * per_event[j, 2]
     if i < n and j > 0 and kind != ALONE and kind != AGAIN:
@@ -177,7 +182,7 @@ def forward(
     """
     first, last, start = bands
     n, m = len(per_still), len(per_event)
-    out = np.zeros(KINDS)
+    out = np.zeros(KINDS + 2)
     states[:] = 0.0
     scale[0] = 0.0
     for j in range(1, last[0] + 1):
@@ -188,7 +193,7 @@ def forward(
     for i in range(n + 1):
         if i > 0 and first[i] == 0:
             states[start[i], ALONE] += math.exp(edges[0][i] - scale[i])
-        greatest = 0.0
+        ended = 0.0
         for j in range(first[i], last[i] + 1):
             k = start[i] + j - first[i]
             if i == 0 and j == 0:  # nothing before the first pair
@@ -200,8 +205,14 @@ def forward(
                 value = states[k, kind]
                 if value < LEAST:
                     continue
-                greatest = max(greatest, value)
                 _moves(i, j, kind, steps[k], per_still, per_event, weights, out)
+                if i == n:
+                    if j == m:
+                        ended += value * math.exp(edges[1][0])
+                    elif kind != EVENT:
+                        ended += value * out[LAST_EVENTS] * math.exp(edges[1][m - j])
+                elif j == m and kind != ALONE:
+                    ended += value * out[LAST_STILLS] * math.exp(edges[0][n - i])
                 if j < last[i]:
                     states[k + 1, EVENT] += value * out[EVENT]
                     states[k + 1, AGAIN] += value * out[AGAIN]
@@ -212,18 +223,6 @@ def forward(
                         states[below, COPY] += value * out[COPY]
                     if first[i + 1] <= j + 1 <= last[i + 1]:
                         states[start[i + 1] + j + 1 - first[i + 1], PAIR] += value * out[PAIR]
-        ended = 0.0
-        if i == n:
-            for j in range(first[n], m + 1):
-                k = start[n] + j - first[n]
-                kinds = states[k, PAIR] + states[k, AGAIN] + states[k, ALONE] + states[k, COPY]
-                if j == m:
-                    kinds += states[k, EVENT]
-                ended += kinds * math.exp(edges[1][m - j])
-        elif last[i] == m:
-            k = start[i] + m - first[i]
-            kinds = states[k, PAIR] + states[k, AGAIN] + states[k, EVENT] + states[k, COPY]
-            ended = kinds * math.exp(edges[0][n - i])
         if ended > 0.0:
             if scale[i] > total_scale:
                 total = total * math.exp(total_scale - scale[i]) + ended if total > 0.0 else ended
@@ -251,7 +250,7 @@ def backward(
     """Fill ``states`` with the sum over all continuations after each state, row i times exp(-scale[i])."""
     first, last, start = bands
     n, m = len(per_still), len(per_event)
-    out = np.zeros(KINDS)
+    out = np.zeros(KINDS + 2)
     states[:] = 0.0
     scale[n] = 0.0
     for i in range(n, -1, -1):
@@ -262,12 +261,15 @@ def backward(
             k = start[i] + j - first[i]
             for kind in range(KINDS):
                 value = 0.0
-                if i == n and (j == m or (kind != EVENT)):
-                    value = math.exp(edges[1][m - j] - scale[i])
-                elif j == m and kind != ALONE:
-                    value = math.exp(edges[0][n - i] - scale[i])
                 if not (i == 0 and j == 0):
                     _moves(i, j, kind, steps[k], per_still, per_event, weights, out)
+                    if i == n:
+                        if j == m:
+                            value = math.exp(edges[1][0] - scale[i])
+                        elif kind != EVENT:
+                            value = out[LAST_EVENTS] * math.exp(edges[1][m - j] - scale[i])
+                    elif j == m and kind != ALONE:
+                        value = out[LAST_STILLS] * math.exp(edges[0][n - i] - scale[i])
                     if j < last[i]:
                         value += out[EVENT] * states[k + 1, EVENT] + out[AGAIN] * states[k + 1, AGAIN]
                     if i < n:
