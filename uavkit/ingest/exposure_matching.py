@@ -26,6 +26,8 @@ from uavkit.ingest.exposure_stamps import ExposureStamps, Shots, StillStamps, se
 
 LEAST_PROBABLE = 0.05
 """A partner less probable than this is not worth naming."""
+SAME_TIME = 1.5
+"""Events of one exposure that lie no further apart than so many times the jitter need no flag."""
 LEAST_LEFT = 6
 """So many stills and events must be left for another clock setting to be looked for."""
 LEAST_PAUSE_S = 60.0
@@ -412,7 +414,7 @@ class _Run:
             if offer.state is StillState.NO_EVENT:
                 return replace(offer, event=-1, probability=1.0 - offer.probability, spread_s=0.0)
             return replace(offer, state=StillState.AMBIGUOUS, spread_s=0.0)
-        if offer.spread_s > 3.0 * self._options.jitter_s:
+        if offer.spread_s > SAME_TIME * self._options.jitter_s:
             told = f"told by several events within {offer.spread_s:.2f} s: {offer.reason.removeprefix('ambiguous: ')}"
             return replace(offer, state=StillState.DOUBLED, reason=told.removesuffix(", or none"))
         return replace(offer, state=StillState.MATCHED, reason="", spread_s=0.0)

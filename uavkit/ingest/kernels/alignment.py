@@ -91,7 +91,7 @@ def fill_steps(
 def _moves(
     i: int, j: int, kind: int, steps: Floats, per_still: Floats, per_event: Floats, weights: Floats, out: Floats
 ) -> None:
-    """Give the weights of the steps from a state: to each kind, and to the first of the stills (events) left at the end.
+    """Give the weights of the steps from a state: to each kind, and to the first still (event) of those left last.
 
     ``per_still`` (n, 3): 1 / density if unrelated, density of the interval before, weight as a copy. ``per_event``
     (m, 5): the same, the density of the interval over two events, and that of any number of exposures between this
