@@ -1,5 +1,6 @@
 """The command line: a command for each stage. It draws progress, words results, and turns errors into one line."""
 
+import math
 import os
 import sys
 import time
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from uavkit.core.result import OrientedBlock
     from uavkit.project import Project
 
+LONGEST_LEVER_ARM_M = 100.0
 EXIT_ERROR = 2
 EXIT_DEFECT = 1
 EXIT_INTERRUPTED = 130
@@ -226,9 +228,14 @@ def ingest(
     crs: Annotated[str, typer.Option(help="EPSG code of the results; else that of the control file, else UTM.")] = "",
     pixel_origin: PixelsFrom = None,
     lever_arm: LeverArm = "0,0,0",
-    shutter_latency: Annotated[float, typer.Option(help="From an exposure event of a log to the exposure, s.")] = 0.0,
+    shutter_latency: Annotated[
+        float, typer.Option(help="From an exposure event of a log to the exposure, s.", min=-60.0, max=60.0)
+    ] = 0.0,
     latency_sigma: Annotated[
-        float, typer.Option(help="How far that may be off, s: the adjustment estimates the rest; 0 holds it.", min=0.0)
+        float,
+        typer.Option(
+            help="How far that may be off, s: the adjustment estimates the rest; 0 holds it.", min=0.0, max=60.0
+        ),
     ] = 0.1,
 ) -> None:
     """Bring stills, video, logs, positions and control together into a block. The originals stay where they are."""
@@ -263,6 +270,8 @@ def _lever_arm(text: str) -> tuple[float, float, float]:
         forward, right, down = (float(part) for part in text.split(","))
     except ValueError:
         raise typer.BadParameter(f"--lever-arm {text!r}: give forward,right,down in metres, like 0.2,0,-0.3") from None
+    if not math.hypot(forward, right, down) <= LONGEST_LEVER_ARM_M:
+        raise typer.BadParameter(f"--lever-arm {text!r}: no antenna is that far from its camera: give metres")
     return forward, right, down
 
 

@@ -53,10 +53,20 @@ def test_a_naive_camera_clock_is_read_as_utc_in_whole_seconds(tmp_path: Path) ->
     assert (still.camera_time_ns, still.camera_time_resolution_ns) == (NOON_NS, 1_000_000_000)
 
 
-@pytest.mark.parametrize("time", ["0000:00:00 00:00:00", "", "yesterday", "1970:01:01 00:00:00"])
+@pytest.mark.parametrize("time", ["0000:00:00 00:00:00", "", "yesterday", "1970:01:01 00:00:00", "9999:12:31 23:59:59"])
 def test_a_clock_never_set_tells_no_time(tmp_path: Path, time: str) -> None:
     write_jpeg(tmp_path / "a.jpg", time=time)
     assert FileStillSource(tmp_path).stills()[0].camera_time_ns is None
+
+
+@pytest.mark.parametrize(("time", "zone"), [("9999:12:31 23:59:59", "-09:00"), ("0001:01:01 00:00:00", "+09:00")])
+def test_a_time_zone_beyond_the_calendar_tells_no_time(tmp_path: Path, time: str, zone: str) -> None:
+    gps = place(35.8, 139.65, tag29="9998:01:01", tag7=(1.0, 2.0, 3.0))
+    write_jpeg(tmp_path / "a.jpg", time=time, detail={36881: zone}, gps=gps)
+    (still,) = FileStillSource(tmp_path).stills()
+    assert still.camera_time_ns is None
+    assert still.position is not None
+    assert still.position.gps_time_ns is None
 
 
 @pytest.mark.parametrize("latitude, longitude", [(35.8, 139.65), (-35.8, 139.65), (35.8, -139.65), (-0.5, -0.25)])

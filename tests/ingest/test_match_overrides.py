@@ -39,7 +39,7 @@ def test_what_is_written_is_read_and_changes_nothing(matching, tmp_path):
     assert result.event_state == matching.event_state
 
 
-@pytest.mark.parametrize("event", ["event 29", "29", "EVENT 29"])
+@pytest.mark.parametrize("event", ["event 29", "30", "EVENT 29"])
 def test_an_event_by_label_or_number(matching, event):
     result = override(matching, (STILLS.name[12], event))
     assert result.event[12] == 29
@@ -82,9 +82,14 @@ def test_two_images_may_change_places(matching):
     [
         ([("DSC0001.JPG", "none")], r"match.csv: line 3: there is no image 'DSC0001.JPG'; did you mean 'DSC0"),
         ([("DSC00001.JPG", "evnt 3")], r"'evnt 3' is no event.*did you mean 'event 3"),
-        ([("DSC00001.JPG", "400")], r"numbered from 0 to 38"),
+        ([("DSC00001.JPG", "400")], r"numbered from 1 to 39"),
+        ([("DSC00001.JPG", "0")], r"numbered from 1 to 39"),
+        ([("DSC00001.JPG", "9" * 5000)], r"is no event"),
+        ([("DSC00001.JPG", "-1")], r"'-1' is no event"),
+        ([("DSC00001.JPG", "²")], r"'²' is no event"),
+        ([("DSC00001.JPG", "9999999999.5")], r"'9999999999.5' is no event"),
         ([("DSC00001.JPG", "12.5")], r"no event is at GPS time 12.5: the nearest is \d+"),
-        ([("DSC00001.JPG", "event 3"), ("DSC00002.JPG", "3")], r"line 4: event 3 is given to DSC00001.JPG and to"),
+        ([("DSC00001.JPG", "event 3"), ("DSC00002.JPG", "4")], r"line 4: event 3 is given to DSC00001.JPG and to"),
     ],
 )
 def test_what_cannot_be_is_refused(matching, rows, message):

@@ -32,6 +32,8 @@ _VERTICAL_CRS = {"EPSG:5773": HeightDatum.GEOID, "ellipsoidal": HeightDatum.ELLI
 """What Pix4D's Camera:VertCS says of EXIF's height; 5773 is EGM96, which ``geotag`` writes."""
 _RTK_WITH_SIGMA = {"34", "50"}
 """DJI's RtkFlag: 50 is fixed, 34 is float; 16 is a single-point position, whose stated sigmas mean nothing."""
+_LAST_NS = gps_time_ns_from_utc(datetime(2200, 1, 1, tzinfo=UTC))
+"""A date behind it is none (and would soon have no place in 64 bits of nanoseconds)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,7 +120,9 @@ def camera_time(main: Mapping[int, Any], detail: Mapping[int, Any]) -> tuple[int
     try:
         moment = datetime(*(int(part) for part in numbers.groups()), tzinfo=UTC)  # type: ignore[misc,arg-type]
         whole = gps_time_ns_from_utc(moment.replace(tzinfo=_offset(detail.get(_ORIGINAL_OFFSET))).astimezone(UTC))
-    except ValueError:  # 0000:00:00 of a clock that was never set
+    except (ValueError, OverflowError):  # 0000:00:00 of a clock that was never set
+        return None, second
+    if whole > _LAST_NS:
         return None, second
     digits = _text(detail.get(_ORIGINAL_SUBSEC))
     if not (digits.isascii() and digits.isdigit() and len(digits) <= 9):
@@ -198,9 +202,10 @@ def _gps_time(gps: Mapping[int, Any]) -> int | None:
         return None
     try:
         midnight = datetime(int(date[1]), int(date[2]), int(date[3]), tzinfo=UTC)
-        return gps_time_ns_from_utc(midnight + timedelta(hours=hours, minutes=minutes, seconds=seconds))
+        time_ns = gps_time_ns_from_utc(midnight + timedelta(hours=hours, minutes=minutes, seconds=seconds))
     except (ValueError, OverflowError):
         return None
+    return time_ns if time_ns <= _LAST_NS else None
 
 
 def _degrees(parts: object, negative: bool) -> float | None:

@@ -6,8 +6,9 @@
     image,event,gps_time,state,probability,reason
     DSC00001.JPG,flight.BIN 12,1412345678.123456789,matched,0.99993,
 
-``image`` and ``event`` are needed, the rest is for the reader. ``event`` is an event's label or number, a GPS time in
-seconds since 1980-01-06 (with a decimal point), or ``none``; a row that is empty there leaves the tool's own decision.
+``image`` and ``event`` are needed, the rest is for the reader. ``event`` is an event's label, its number among all
+(from 1), a GPS time in seconds since 1980-01-06 (with a decimal point), or ``none``; a row that is empty there leaves
+the tool's own decision.
 """
 
 import csv

@@ -14,7 +14,7 @@ from uavkit.core.arrays import Array, Indices
 from uavkit.core.errors import InputError
 from uavkit.core.flight_log import ExposureKind, FlightLog
 from uavkit.core.gpstime import NO_TIME
-from uavkit.core.records import GnssFix
+from uavkit.core.records import ExposureEvent, GnssFix
 from uavkit.ingest.camera_position import AttitudeTrack, build_attitudes, camera_positions
 from uavkit.ingest.gnss_delay import estimate_gnss_delay
 from uavkit.ingest.trajectory import Trajectory, build_trajectory
@@ -153,8 +153,9 @@ def positions_of_events(
             continue
         times = np.array([events[n][2] + latency_ns for n in mine], dtype=np.int64)
         others = [other for other in flights if other is not flight and other.number == flight.number]
+        logged = list(flight.log.exposures())
         for n, time_ns, place in zip(mine, times.tolist(), _places([flight, *others], times, options), strict=True):
-            found = place or _as_logged(flight, events[n][1])
+            found = place or _as_logged(logged[events[n][1]])
             fix, velocity, reason = found
             result[n] = EventPosition(
                 gps_time_ns=time_ns, fix=fix, velocity_m_s=velocity, flight=flight.number, reason=reason
@@ -184,9 +185,8 @@ def _velocity(velocity_m_s: Array) -> tuple[float, float, float] | None:
     return (east, north, up) if np.isfinite([east, north, up]).all() else None
 
 
-def _as_logged(flight: LoggedFlight, row: int) -> _Place:
+def _as_logged(event: ExposureEvent) -> _Place:
     """Return the position that the event itself tells, if any."""
-    event = list(flight.log.exposures())[row]
     if event.position is not None:
         return event.position, None, ""
     return None, None, "the log tells no position at that time"

@@ -7,6 +7,7 @@ from typing import TypeGuard
 import numpy as np
 
 from uavkit.core.block import VideoSync
+from uavkit.core.errors import InputError
 from uavkit.core.exposures import CameraClock, ExposureMatches, StillExposure, StillState, UnusedEvent
 from uavkit.core.flight_log import FlightLog
 from uavkit.core.gpstime import NO_TIME
@@ -67,12 +68,14 @@ def stills_in_logs(
     """Match the stills with the exposures of logs, and place them by the logs' fixes at these times.
 
     Where the shutters of most stills show in the video, their times there take the place of EXIF's, which are coarser.
-    Raises InputError where what is given by hand names no still or no exposure.
+    Raises InputError where what is given by hand names no still or no exposure, or there is none to give.
     """
     flights = prepare_flights(logs)
     notes = [note for flight in flights for note in flight.notes]
     merged = _merged(flights)
     if not len(merged.stamps.gps_ns):
+        if given.rows:
+            raise InputError(f"{given.source}: no log tells of exposures with times, which stills could be given to")
         if logs:
             notes.append("no log tells of exposures with times: the stills cannot be matched with the logs by time")
         return LoggedStills(matches=None, joined=_nothing(len(infos)), notes=tuple(notes), lever_arm_taken_off=False)
@@ -101,21 +104,31 @@ def _nothing(count: int) -> JoinedPositions:
 
 def _merged(flights: Sequence[LoggedFlight]) -> MergedExposures:
     """Return the exposures of all logs, each once, by corrected GPS time."""
+    names = short_names([flight.log.source for flight in flights])
     stamps = [
         ExposureStamps(
             gps_ns=flight.event_gps_ns,
             sigma_s=flight.log.exposure_table.sigma_s[flight.events],
-            label=tuple(_label(flight.log, row) for row in flight.events.tolist()),
+            label=tuple(_label(flight.log, name, row) for row in flight.events.tolist()),
         )
-        for flight in flights
+        for flight, name in zip(flights, names, strict=True)
     ]
     return merge_exposures(stamps, [flight.log.source for flight in flights])
 
 
-def _label(log: FlightLog, row: int) -> str:
+def short_names(sources: Sequence[str]) -> list[str]:
+    """Return the ends of paths that tell them apart: the files' names, with as many folders as that needs."""
+    parts = [source.split("/") for source in sources]
+    for depth in range(1, max(map(len, parts), default=0)):
+        names = ["/".join(path[-depth:]) for path in parts]
+        if len(set(names)) == len(set(sources)):
+            return names
+    return list(sources)
+
+
+def _label(log: FlightLog, name: str, row: int) -> str:
     """Return what the user knows an event by: its log, and its number there."""
     sequence = int(log.exposure_table.sequence[row])
-    name = log.source.rsplit("/", 1)[-1]
     return f"{name} {row + 1}" if sequence in (-1, row + 1) else f"{name} {row + 1} (number {sequence})"
 
 

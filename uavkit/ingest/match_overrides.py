@@ -1,5 +1,6 @@
 """What the user decides by hand goes before what the matching found; and the matching as rows of a file to edit."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -13,6 +14,8 @@ from uavkit.ingest.exposure_stamps import ExposureStamps
 
 NEAR_S = 0.05
 """A GPS time means the event so near to it."""
+_LAST_S = 2**63 // 10**9 - 1
+"""What comes later has no place in 64 bits of nanoseconds."""
 
 
 def match_rows(matching: ExposureMatching, names: Sequence[str], events: ExposureStamps) -> tuple[MatchRow, ...]:
@@ -117,19 +120,18 @@ def _wanted(names: Sequence[str], events: ExposureStamps, rows: Sequence[MatchRo
 
 
 def _event(text: str, labels: dict[str, int], events: ExposureStamps, place: str) -> int:
-    """Return the row of an event named by its label, its number, or its GPS time."""
+    """Return the row of an event named by its label, its number (from 1), or its GPS time."""
     if text.casefold() in labels:
         return labels[text.casefold()]
-    if text.isdigit():
-        if int(text) < len(events.label):
-            return int(text)
-        raise InputError(f"{place}: there is no event {text}: they are numbered from 0 to {len(events.label) - 1}")
-    try:
-        whole, _, part = text.partition(".")
-        gps_ns = int(whole) * 10**9 + int(part.ljust(9, "0")[:9])
-    except ValueError:
+    time = re.fullmatch(r"([0-9]{1,10})(?:\.([0-9]{0,30}))?", text)
+    if time is not None and time[2] is None:
+        if 1 <= int(text) <= len(events.label):
+            return int(text) - 1
+        raise InputError(f"{place}: there is no event {text}: they are numbered from 1 to {len(events.label)}")
+    if time is None or int(time[1]) > _LAST_S:
         hint = did_you_mean(text, list(events.label))
-        raise InputError(f"{place}: {text!r} is no event, no GPS time in seconds, and not {NONE!r}{hint}") from None
+        raise InputError(f"{place}: {text[:60]!r} is no event, no GPS time in seconds, and not {NONE!r}{hint}")
+    gps_ns = int(time[1]) * 10**9 + int(time[2].ljust(9, "0")[:9])
     known = np.flatnonzero(events.gps_ns != NO_TIME)
     apart_s = np.abs(events.gps_ns[known] - gps_ns) * 1e-9
     if len(known) == 0 or float(apart_s.min()) > NEAR_S:

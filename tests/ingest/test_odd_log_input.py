@@ -1,0 +1,106 @@
+"""Odd logs and decisions by hand: logs of like names are told apart, and what cannot be meant is refused."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from uavkit.core.errors import InputError
+from uavkit.core.flight_log import (
+    ExposureKind,
+    FlightLog,
+    LogKind,
+    Stamps,
+    exposure_table,
+    no_attitudes,
+    no_exposures,
+    no_fixes,
+)
+from uavkit.core.progress import silent
+from uavkit.core.records import StillInfo
+from uavkit.formats.flight_logs import open_log
+from uavkit.formats.match_file import MatchRow
+from uavkit.ingest.log_positions import LogOptions, positions_of_events, prepare_flights
+from uavkit.ingest.logged_stills import GivenMatches, short_names, stills_in_logs
+
+RECORDED = Path(__file__).resolve().parents[2] / "sim_logs"
+
+
+def stills_of(log: FlightLog, count: int) -> list[StillInfo]:
+    times = log.exposure_table.when.gps_ns[:count].tolist()
+    return [
+        StillInfo(
+            name=f"R{row:04d}.JPG",
+            width_px=400,
+            height_px=300,
+            camera_time_ns=time_ns // 10**7 * 10**7,
+            camera_time_resolution_ns=10**7,
+        )
+        for row, time_ns in enumerate(times)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("sources", "names"),
+    [
+        (["/a/x.BIN"], ["x.BIN"]),
+        (["/a/x.BIN", "/a/y.BIN"], ["x.BIN", "y.BIN"]),
+        (["/a/b/x.BIN", "/a/c/x.BIN", "/a/b/z.BIN"], ["b/x.BIN", "c/x.BIN", "b/z.BIN"]),
+        (["/a/s/x.BIN", "/b/s/x.BIN"], ["a/s/x.BIN", "b/s/x.BIN"]),
+        (["/a/x.BIN", "/a/x.BIN"], ["x.BIN", "x.BIN"]),
+        (["x.BIN", "a/x.BIN"], ["x.BIN", "a/x.BIN"]),
+        ([], []),
+    ],
+)
+def test_logs_of_like_names_are_told_apart_by_their_folders(sources: list[str], names: list[str]) -> None:
+    assert short_names(sources) == names
+
+
+def test_an_exposure_of_the_first_of_two_logs_of_like_names_can_be_given_by_its_label() -> None:
+    """Both logs are called flight.BIN: "flight.BIN 5" would be of both."""
+    logs = [open_log(RECORDED / folder / "flight.BIN") for folder in ("sitl_distance_trigger", "sitl_waypoint_trigger")]
+    stills = stills_of(logs[0], 31)
+    row = MatchRow(image=stills[0].name, event="sitl_distance_trigger/flight.BIN 5", line=2)
+    given = GivenMatches(rows=(row,), source="match.csv")
+    result = stills_in_logs(stills, logs, given, LogOptions(), silent)
+    assert result.matches is not None
+    assert result.matches.stills[0].event == 5
+    labels = [entry.source for entry in result.matches.unused] + [entry.label for entry in result.matches.stills]
+    assert len({label for label in labels if label}) == 64
+
+
+def test_what_is_given_by_hand_needs_exposures_to_be_given() -> None:
+    log = replace(open_log(RECORDED / "sitl_distance_trigger/flight.BIN"), exposure_table=no_exposures())
+    stills = [StillInfo(name="a.jpg", width_px=4, height_px=3), StillInfo(name="b.jpg", width_px=4, height_px=3)]
+    given = GivenMatches(rows=(MatchRow(image="a.jpg", event="1", line=2),), source="match.csv")
+    for logs in ((), (log,)):
+        with pytest.raises(InputError, match=r"match\.csv: no log tells of exposures with times"):
+            stills_in_logs(stills, logs, given, LogOptions(), silent)
+
+
+def test_a_long_list_of_timed_waypoints_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Positions that the log itself tells are taken from one pass over it, however many stills want one."""
+    count = 1000
+    when = Stamps.of(count, gps_ns=1_450_000_000_000_000_000 + np.arange(count) * 3_000_000_000)
+    places = {"latitude_deg": np.linspace(35.8, 35.9, count), "longitude_deg": np.full(count, 139.65)}
+    log = FlightLog(
+        source="list.kml",
+        kind=LogKind.KML,
+        fix_table=no_fixes(),
+        estimate_table=no_fixes(),
+        attitude_table=no_attitudes(),
+        exposure_table=exposure_table(when, ExposureKind.LISTED, **places),
+    )
+    flights = prepare_flights([log])
+    passes, original = [], FlightLog.exposures
+
+    def counted(self: FlightLog) -> object:
+        passes.append(1)
+        return original(self)
+
+    monkeypatch.setattr(FlightLog, "exposures", counted)
+    events = [(0, row, int(when.gps_ns[row])) for row in range(count)]
+    found = positions_of_events(flights, events, LogOptions())
+    assert [place.fix.latitude_deg for place in found if place.fix] == places["latitude_deg"].tolist()
+    assert len(passes) == 1
