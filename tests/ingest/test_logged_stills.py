@@ -12,7 +12,8 @@ from uavkit.core.block import StillInVideo, VideoSync
 from uavkit.core.errors import InputError
 from uavkit.core.exposures import StillState
 from uavkit.core.flight_log import FlightLog, fix_table, no_attitudes, no_exposures, no_fixes
-from uavkit.core.frames import LocalFrame
+from uavkit.core.frames import LocalFrame, geoid_undulation_m
+from uavkit.core.heights import HeightDatum
 from uavkit.core.progress import silent
 from uavkit.core.records import FieldOrder, StillInfo
 from uavkit.core.video import AffineTransformation
@@ -252,6 +253,11 @@ def test_a_gap_in_the_fixes_leaves_the_position_of_the_event(logs: dict[str, Fli
     assert fix is not None
     assert fix.latitude_deg == pytest.approx(float(log.exposure_table.latitude_deg[15]), abs=1e-9)
     assert fix.sigma_horizontal_m is None
+    geoid_m = float(log.exposure_table.height_geoid_m[15])
+    assert fix.height_datum is HeightDatum.ELLIPSOID
+    assert fix.height_m - geoid_m == pytest.approx(
+        float(geoid_undulation_m(np.array(35.8), np.array(139.65))), abs=0.01
+    )
 
 
 def test_truth_of_the_flight_is_the_events_own() -> None:

@@ -13,7 +13,9 @@ import numpy as np
 from uavkit.core.arrays import Array, Indices
 from uavkit.core.errors import InputError
 from uavkit.core.flight_log import ExposureKind, FlightLog
+from uavkit.core.frames import ellipsoid_heights_m
 from uavkit.core.gpstime import NO_TIME
+from uavkit.core.heights import HeightDatum
 from uavkit.core.records import ExposureEvent, GnssFix
 from uavkit.ingest.camera_position import AttitudeTrack, build_attitudes, camera_positions
 from uavkit.ingest.gnss_delay import estimate_gnss_delay
@@ -160,7 +162,27 @@ def positions_of_events(
             result[n] = EventPosition(
                 gps_time_ns=time_ns, fix=fix, velocity_m_s=velocity, flight=flight.number, reason=reason
             )
-    return tuple(result[n] for n in range(len(events)))
+    return _of_one_datum([result[n] for n in range(len(events))])
+
+
+def _of_one_datum(places: list[EventPosition]) -> tuple[EventPosition, ...]:
+    """Return the positions with heights of one datum: mixed ones become ellipsoidal, others that cannot are left out.
+
+    The track of one log may tell ellipsoidal heights, an event of another only that above the geoid.
+    """
+    datums = {place.fix.height_datum for place in places if place.fix is not None}
+    if len(datums) < 2:
+        return tuple(places)
+    return tuple(place if place.fix is None else _ellipsoidal(place, place.fix) for place in places)
+
+
+def _ellipsoidal(place: EventPosition, fix: GnssFix) -> EventPosition:
+    if fix.height_datum not in (HeightDatum.ELLIPSOID, HeightDatum.GEOID):
+        reason = f"its height is of another datum ({fix.height_datum.value}) than the others'"
+        return replace(place, fix=None, reason=reason)
+    where = np.array([fix.latitude_deg]), np.array([fix.longitude_deg])
+    height_m = ellipsoid_heights_m(*where, np.array([fix.height_m]), fix.height_datum)
+    return replace(place, fix=replace(fix, height_m=float(height_m[0]), height_datum=HeightDatum.ELLIPSOID))
 
 
 _Place = tuple[GnssFix | None, tuple[float, float, float] | None, str]
