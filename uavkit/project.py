@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import socket
+import stat
 import sys
 import zipfile
 import zlib
@@ -152,10 +153,16 @@ class Project:
         write_text(self.folder / MANIFEST, manifest.model_dump_json(indent=2) + "\n")
 
     def original(self, path: Path) -> Original:
-        """Return how the manifest refers to a file or folder; raises InputError where it does not exist."""
+        """Return how the manifest refers to a file or folder; raises InputError where it is none."""
         absolute = Path(os.path.abspath(path))  # noqa: PTH100
-        if not absolute.exists():
-            raise InputError(f"{path} does not exist: check the path")
+        try:
+            mode = absolute.stat().st_mode
+        except (FileNotFoundError, NotADirectoryError):
+            raise InputError(f"{path} does not exist: check the path") from None
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise InputError(f"{path}: is a device or a pipe: give a file or a folder")
         try:
             relative = os.path.relpath(absolute, self.folder)
         except ValueError:  # another drive

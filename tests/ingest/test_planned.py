@@ -1,5 +1,6 @@
 """A plan against what was taken: stations without a still are named; planned places stand in where no others are."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,28 @@ def test_stations_without_a_still_are_named() -> None:
     assert "near 2 planned stations: station 5, station 17" in note
     (whole,) = planned_notes(fixes(planned), joined(list(fixes(planned + 0.5))))
     assert "near each planned station" in whole
+
+
+@pytest.mark.parametrize(("latitude_deg", "longitude_deg", "away_km"), [(-20.0, 10.0, 11_700), (-35.8, -40.35, 12_700)])
+def test_a_plan_of_another_place_is_told_so(latitude_deg: float, longitude_deg: float, away_km: float) -> None:
+    """The second place is on the other side of the earth, whose plane projection falls on the stills."""
+    there = GnssFix(
+        gps_time_ns=None, latitude_deg=latitude_deg, longitude_deg=longitude_deg, height_m=float("nan"),
+        height_datum=HeightDatum.GROUND,
+    )  # fmt: skip
+    beside = replace(there, latitude_deg=latitude_deg + 1e-4)
+    (note,) = planned_notes([there, beside], joined(list(fixes(strips()))))
+    assert "is it this flight's?" in note
+    told_km = float(note.split(" km from all")[0].split()[-1])
+    assert told_km == pytest.approx(away_km, rel=0.02)  # along a straight line through the earth
+
+
+def test_a_mission_without_pictures_is_no_plan_to_compare_with(tmp_path: Path) -> None:
+    path = tmp_path / "way.waypoints"
+    rows = [f"{n}\t0\t3\t16\t0\t0\t0\t0\t{35.8 + n * 1e-4}\t139.65\t15\t1" for n in range(4)]
+    path.write_text("\n".join(["QGC WPL 110", *rows, ""]))
+    with pytest.raises(InputError, match="takes no picture"):
+        expected_positions(path)
 
 
 def test_without_positions_only_the_numbers_are_told() -> None:

@@ -6,7 +6,7 @@ from typing import Protocol
 from uavkit.core.errors import InputError
 from uavkit.core.flight_log import FlightLog, LogKind
 from uavkit.core.progress import Progress, silent
-from uavkit.formats.log_bytes import opened
+from uavkit.formats.log_bytes import check_is_file, opened
 
 HEAD_BYTES = 64 * 1024
 """What a reader sees to recognise its kind; zeros at the beginning of a file are left out."""
@@ -45,8 +45,7 @@ def _readers() -> tuple[LogReader, ...]:
 
 def _head(path: Path) -> bytes:
     """Return the first bytes from the first that is not zero."""
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder: give the log file in it")
+    check_is_file(path, "a folder: give the log file in it")
     zeros = bytes(_BLOCK_BYTES)
     with opened(path) as stream:
         while block := stream.read(_BLOCK_BYTES):

@@ -1,5 +1,6 @@
 """Logs as streams of bytes: read in blocks with bounded memory, what is lost counted span by span."""
 
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -75,6 +76,18 @@ class DamageTally:
     def result(self) -> Damage:
         """Return what was counted."""
         return Damage(lost_bytes=self._lost, span_count=self._count, spans=tuple(self._spans))
+
+
+def check_is_file(path: Path, as_a_folder: str) -> None:
+    """Raise InputError for what is no file: missing, a folder, or a pipe or device, which may have no end."""
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+    if stat.S_ISDIR(mode):
+        raise InputError(f"{path}: is {as_a_folder}")
+    if not stat.S_ISREG(mode):
+        raise InputError(f"{path}: is a device or a pipe, no file: copy what comes from it into a file, and give that")
 
 
 @contextmanager

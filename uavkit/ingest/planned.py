@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from uavkit.core.arrays import Array
 from uavkit.core.frames import LocalFrame
@@ -14,6 +15,8 @@ PLANNED_SIGMA_M = 5.0
 """Of a planned position as that of the still: vehicles cut corners and trigger late."""
 TAKEN_SHARE = 0.6
 """A station counts as taken if a still lies nearer than this share of the usual distance between stations."""
+ELSEWHERE_M = 500.0
+"""A plan all of whose stations are farther from all stills is of another flight."""
 MOST_NAMED = 12
 
 
@@ -35,9 +38,13 @@ def planned_notes(planned: Sequence[GnssFix], joined: JoinedPositions) -> tuple[
     if len(fixes) < 3 or len(planned) < 2:
         return (counted,)
     frame = LocalFrame.at(planned[0].latitude_deg, planned[0].longitude_deg, 0.0)
-    wanted_m, taken_m = _plane(planned, frame), _plane(fixes, frame)
+    wanted_m, taken_m = _level(planned, frame), _level(fixes, frame)
     usual_m = float(np.median(np.linalg.norm(np.diff(wanted_m, axis=0), axis=1)))
-    nearest_m = np.min(np.linalg.norm(wanted_m[:, None] - taken_m[None], axis=2), axis=1)
+    nearest_m, _ = cKDTree(taken_m).query(wanted_m)
+    if nearest_m.min() > max(ELSEWHERE_M, usual_m):
+        return (
+            f"{counted}, the nearest {nearest_m.min() * 1e-3:.1f} km from all of its stations: is it this flight's?",
+        )
     missed = [planned[n].name or str(n + 1) for n in np.flatnonzero(nearest_m > TAKEN_SHARE * usual_m).tolist()]
     if not missed:
         return (f"{counted}; a still lies near each planned station",)
@@ -45,6 +52,7 @@ def planned_notes(planned: Sequence[GnssFix], joined: JoinedPositions) -> tuple[
     return (f"{counted}; no still lies near {len(missed)} planned stations: {named}",)
 
 
-def _plane(fixes: Sequence[GnssFix], frame: LocalFrame) -> Array:
+def _level(fixes: Sequence[GnssFix], frame: LocalFrame) -> Array:
+    """Return the places at height 0, (n, 3): on the plane alone the other side of the earth would be near."""
     latitude, longitude = np.array([[fix.latitude_deg, fix.longitude_deg] for fix in fixes]).T
-    return np.asarray(frame.enu_from_geographic(latitude, longitude, np.zeros(len(fixes)))[:, :2])
+    return np.asarray(frame.enu_from_geographic(latitude, longitude, np.zeros(len(fixes))))

@@ -16,8 +16,15 @@ def expected_positions(path: Path) -> tuple[GnssFix, ...]:
     """Return the places of the exposures in their order, named by their stations or numbers.
 
     Of a table of exposures, a .flightplan.json, a .plan or a .waypoints. Heights are left out (NaN, above ground): a
-    vehicle keeps them less well than its place. Raises InputError where the file is none of these.
+    vehicle keeps them less well than its place. Raises InputError where the file is none of these, or takes no picture.
     """
+    found = _expected(path)
+    if not found:
+        raise InputError(f"{path}: takes no picture: give the plan with the commands to the camera")
+    return found
+
+
+def _expected(path: Path) -> tuple[GnssFix, ...]:
     name = path.name.lower()
     if name.endswith((".csv", ".flightplan.json")):
         table = read_exposures_csv(path) if name.endswith(".csv") else read_flightplan(path).exposures
