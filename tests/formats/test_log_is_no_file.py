@@ -1,13 +1,18 @@
-"""Pipes and devices have no end: they are refused at once, as are paths that cannot be."""
+"""Pipes and devices have no end: they are refused at once, as are paths that cannot be; logs are never overwritten."""
 
 import os
 from pathlib import Path
 
 import pytest
 
+from tests.formats.media import write_jpeg
 from uavkit.core.errors import InputError
 from uavkit.formats.flight_logs import open_log
+from uavkit.formats.image_files import FileStillSource
+from uavkit.formats.log_export import ExportKind, export_log
 from uavkit.project import Project
+
+BROKEN = Path(__file__).resolve().parents[2] / "sim_logs/broken_logs"
 
 
 def test_a_pipe_that_nobody_writes_to_does_not_hold_the_reader(tmp_path: Path) -> None:
@@ -41,3 +46,47 @@ def test_a_circle_of_links_is_named(tmp_path: Path) -> None:
     for read in (open_log, Project(tmp_path / "survey").original):
         with pytest.raises(InputError, match=r"circle\.BIN"):
             read(tmp_path / "circle.BIN")
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"), [("pipe", "a pipe or a device"), ("link", "a link to nothing"), ("folder", "a folder")]
+)
+def test_what_is_named_like_a_still_but_is_none_is_named(kind: str, words: str, tmp_path: Path) -> None:
+    write_jpeg(tmp_path / "b.jpg")
+    path = tmp_path / "a.jpg"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "link":
+        path.symlink_to(tmp_path / "nowhere.jpg")
+    else:
+        path.mkdir()
+    with pytest.raises(InputError, match=f"a.jpg: is {words}"):
+        FileStillSource(tmp_path)
+
+
+def test_a_folder_that_must_not_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(_: Path) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "iterdir", refused)
+    with pytest.raises(InputError, match=r"cannot be read \(Permission denied\)"):
+        FileStillSource(tmp_path)
+
+
+@pytest.mark.parametrize(("name", "kind"), [("no_times.kml", ExportKind.KML), ("gpx_cut.gpx", ExportKind.GPX)])
+def test_an_export_does_not_overwrite_the_log_that_it_was_read_from(
+    name: str, kind: ExportKind, tmp_path: Path
+) -> None:
+    """By its folder, by its own name, by a link to it."""
+    content = (BROKEN / name).read_bytes()
+    path = tmp_path / name
+    path.write_bytes(content)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / name).symlink_to(path)
+    log = open_log(path)
+    for out in (tmp_path, path, tmp_path / "other"):
+        with pytest.raises(InputError, match="is the log itself"):
+            export_log(log, out, kind)
+        assert path.read_bytes() == content
+    (written,) = export_log(log, tmp_path / "third", kind)
+    assert written.read_bytes() != content

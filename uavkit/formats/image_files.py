@@ -135,10 +135,18 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
 
 
 def _stills_of_folder(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        what = "is a file, not a folder" if folder.exists() else "does not exist"
-        raise InputError(f"{folder}: {what}: give the folder of the stills")
-    found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
+    try:
+        if not folder.is_dir():
+            what = "is a file, not a folder" if folder.exists() else "does not exist"
+            raise InputError(f"{folder}: {what}: give the folder of the stills")
+        entries = list(folder.iterdir())
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read ({error.strerror or error})") from error
+    found = [path for path in entries if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
+    for path in found:
+        if not path.is_file():
+            what = "a folder" if path.is_dir() else "a link to nothing" if path.is_symlink() else "a pipe or a device"
+            raise InputError(f"{path}: is {what}, no still: move it elsewhere, or rename it")
     if found:
         return found
     below = sorted({path.parent for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES})

@@ -62,6 +62,7 @@ def export_log(log: FlightLog, path: Path, kind: ExportKind) -> tuple[Path, ...]
         if not len(_places(log.fix_table)) and not len(_places(log.exposure_table)):
             raise InputError(f"{log.source}: no position in it that could be written as {kind.name}")
         written = stem.with_name(stem.name + suffix)
+        _check_not_the_log(log, written)
         (_write_kml if kind is ExportKind.KML else _write_gpx)(log, written)
         return (written,)
     write: Callable[[FlightLog, Role, Path], None] = _write_csv if kind is ExportKind.CSV else _write_parquet
@@ -69,10 +70,17 @@ def export_log(log: FlightLog, path: Path, kind: ExportKind) -> tuple[Path, ...]
     for role in Role:
         if len(table_of(log, role)):
             files.append(stem.with_name(f"{stem.name}_{role.value}{suffix}"))
+            _check_not_the_log(log, files[-1])
             write(log, role, files[-1])
     if not files:
         raise InputError(f"{log.source}: no positions, attitudes or exposures in it to write")
     return tuple(files)
+
+
+def _check_not_the_log(log: FlightLog, path: Path) -> None:
+    """Raise InputError where a file to be written is the log itself: what it was read from would be lost."""
+    if path.exists() and Path(log.source).exists() and path.samefile(log.source):
+        raise InputError(f"{path}: is the log itself, which is never changed: give another folder")
 
 
 def _write_csv(log: FlightLog, role: Role, path: Path) -> None:
