@@ -95,6 +95,8 @@ def pairs_of(chain: Chain, clock: Clock, blur_s: float | Array) -> Pairs:
     shares = np.zeros((len(steps), KINDS))
     if total > -1e299:
         posterior(bands, (before, before_scale), (after, after_scale), total, shares)
+    if not float(shares.max(initial=0.0)) < 1.0 + 1e-6:  # sums so small that they were lost: nothing fits here
+        shares[:] = 0.0
     row = np.repeat(np.arange(n + 1), np.diff(bands[2]))
     told = np.arange(len(steps)) - bands[2][row] + bands[0][row]
     k = np.flatnonzero(shares[:, PAIR] > LEAST_SHARE)
