@@ -39,6 +39,7 @@ from uavkit.core.flight_log import (
 )
 from uavkit.core.gpstime import NO_TIME, WEEK_NS
 from uavkit.formats.dataflash_fields import NO_ROWS, VEHICLE, Column, Messages, Rows, joined
+from uavkit.formats.dataflash_starts import joined_starts
 from uavkit.formats.log_times import with_gps_times
 
 FEEDBACK_SIGMA_S = 0.001
@@ -65,7 +66,8 @@ def flight_log(messages: Messages, source: str, kind: LogKind) -> FlightLog:
 
 
 def _flight_log(messages: Messages, source: str, kind: LogKind) -> FlightLog:
-    notes = list(messages.notes)
+    messages, notes_of_starts = joined_starts(messages)
+    notes = [*messages.notes, *notes_of_starts]
     gps = _receivers(messages)
     fixes, gps_boot_ns = _fixes(gps, notes)
     clock = fit_clock(gps_boot_ns, fixes.when.gps_ns)
