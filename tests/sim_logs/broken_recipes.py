@@ -117,6 +117,13 @@ def dataflash_zeros_at_the_end() -> Broken:
     return replace(whole, data=whole.data + bytes(8000), note="ends with 8000 zero bytes")
 
 
+def dataflash_two_starts() -> Broken:
+    """Of the second flight the fixes and exposures, enough for its own times."""
+    second = [piece for piece in recorded.dataflash(WAYPOINT) if piece.name in ("GPS", "CAM", "ATT")]
+    both = recorded.dataflash(DISTANCE) + second
+    return _dataflash(both, "two flights joined into one file: boot times begin anew", note="was started 2 times")
+
+
 def text_named() -> Broken:
     text = "Flight over the embankment: wind from the west, 3 m/s, nothing odd. Landed with 40 %.\n" * 20
     return Broken(data=text.encode(), defect="a pilot's notes under a log's name", error="this is text, no flight log")
@@ -429,6 +436,7 @@ RECIPES: dict[str, Callable[[], Broken]] = {
     "dataflash_formats_lost.BIN": dataflash_formats_lost,
     "dataflash_no_fix.BIN": dataflash_no_fix,
     "dataflash_one_format_lost.BIN": dataflash_one_format_lost,
+    "dataflash_two_starts.BIN": dataflash_two_starts,
     "dataflash_zeros_at_the_end.BIN": dataflash_zeros_at_the_end,
     "empty.BIN": empty,
     "entity_bomb.kml": entity_bomb,
