@@ -21,6 +21,8 @@ MOST_IMPROVED = (80, 60, 45, 30)
 FEWER_SHARE = 0.25
 """Windows that hold so many fewer pairs than the best are not looked at."""
 FEWER_AT_LEAST = 10.0
+MOST_SHIFT = 6
+MOST_ROUNDS = 4
 MOST_DRIFTS = 41
 NEAR_BEST = 20.0
 """Settings whose logarithm is so much lower than the best do not count."""
@@ -55,6 +57,27 @@ def best_clocks(chain: Chain, limits: ClockLimits) -> list[WeighedClock]:
     for blur_s, each, most in zip((blur, 0.5 * blur, 0.0), (0.2, 0.12, 0.06), MOST_IMPROVED[1:], strict=True):
         found = [_improved(chain, entry.clock, blur_s, limits) for entry in found]
         found = _without_doubles(chain, _nearly_best(found, each * pairs, most))
+    for _ in range(MOST_ROUNDS if found else 0):
+        best = found[0]
+        found = _without_doubles(chain, found + _neighbours(chain, best.clock, limits))
+        found = _nearly_best(found, 0.06 * pairs, MOST_IMPROVED[-1])
+        if found[0].log_sum <= best.log_sum:
+            break
+    return found
+
+
+def _neighbours(chain: Chain, clock: Clock, limits: ClockLimits) -> list[WeighedClock]:
+    """Return the settings at which the stills belong to events a few further on or back.
+
+    In a regular flight these are nearly as good, and the votes may have named only some of them.
+    """
+    found = []
+    noise = 2.5 * chain.noise_s + _vote_step(chain)
+    for k in range(1, min(MOST_SHIFT, len(chain.event_s) - 1) + 1):
+        shift_s = float(np.median(chain.event_s[k:] - chain.event_s[:-k]))
+        for sign in (-1.0, 1.0):
+            moved = _fitted_to_nearest(chain, clock.moved(sign * shift_s, 0.0), noise, limits)
+            found.append(_improved(chain, _improved(chain, moved, 0.5 * _vote_step(chain), limits).clock, 0.0, limits))
     return found
 
 
