@@ -90,3 +90,16 @@ def test_an_export_does_not_overwrite_the_log_that_it_was_read_from(
         assert path.read_bytes() == content
     (written,) = export_log(log, tmp_path / "third", kind)
     assert written.read_bytes() != content
+
+
+def test_an_export_into_a_folder_that_must_not_be_entered_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = open_log(BROKEN / "no_times.kml")
+
+    def refused(path: Path, _: object) -> bool:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "samefile", refused)
+    with pytest.raises(InputError, match=r"no_times.kml: cannot be written \(Permission denied\)"):
+        export_log(log, tmp_path / "out", ExportKind.KML)

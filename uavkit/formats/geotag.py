@@ -143,7 +143,7 @@ def _refuse_same_file(source: Path, target: Path) -> None:
     try:
         same = source.resolve() == target.resolve() or (target.exists() and target.samefile(source))
     except (OSError, RuntimeError) as error:
-        raise InputError(f"{source}: cannot be read ({error})") from error
+        raise InputError(f"{target}: cannot be written beside {source} ({error})") from error
     if same:
         raise InputError(f"{target}: is the original itself: originals are never changed, give another folder")
 

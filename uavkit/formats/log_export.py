@@ -79,7 +79,13 @@ def export_log(log: FlightLog, path: Path, kind: ExportKind) -> tuple[Path, ...]
 
 def _check_not_the_log(log: FlightLog, path: Path) -> None:
     """Raise InputError where a file to be written is the log itself: what it was read from would be lost."""
-    if path.exists() and Path(log.source).exists() and path.samefile(log.source):
+    try:
+        same = path.samefile(log.source)
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    if same:
         raise InputError(f"{path}: is the log itself, which is never changed: give another folder")
 
 
