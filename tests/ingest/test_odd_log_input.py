@@ -70,6 +70,24 @@ def test_an_exposure_of_the_first_of_two_logs_of_like_names_can_be_given_by_its_
     assert len({label for label in labels if label}) == 64
 
 
+@pytest.mark.parametrize(
+    ("days", "doubtful"), [(0.0, False), (0.6, False), (-0.6, False), (728.0, True), (-30.0, True)]
+)
+def test_a_log_of_another_day_is_matched_by_its_intervals_but_called_doubtful(days: float, doubtful: bool) -> None:
+    """A camera that lost its date has the intervals of the flight all the same; so has a flight repeated exactly."""
+    log = open_log(RECORDED / "sitl_distance_trigger/flight.BIN")
+    stills = [
+        replace(still, camera_time_ns=still.camera_time_ns + round(days * 86_400e9))
+        for still in stills_of(log, 31)
+        if still.camera_time_ns is not None
+    ]
+    result = stills_in_logs(stills, [log], GivenMatches(), LogOptions(), silent)
+    assert result.joined.count > 28
+    told = [note for note in result.notes if "another flight of the same pattern" in note]
+    assert len(told) == doubtful
+    assert not doubtful or f"are {abs(days):.0f} days from" in told[0]
+
+
 def test_what_is_given_by_hand_needs_exposures_to_be_given() -> None:
     log = replace(open_log(RECORDED / "sitl_distance_trigger/flight.BIN"), exposure_table=no_exposures())
     stills = [StillInfo(name="a.jpg", width_px=4, height_px=3), StillInfo(name="b.jpg", width_px=4, height_px=3)]

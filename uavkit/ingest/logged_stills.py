@@ -31,6 +31,8 @@ from uavkit.ingest.positions import JoinedPositions, PositionOptions
 LEAST_SHOWN, SHARE_SHOWN = 5, 0.8
 """So many stills, and so much of all, must show their shutter in the video for its times to be used."""
 BY_HAND = "by hand"
+OTHER_DAY_S = 36 * 3600.0
+"""Local time is at most 14 hours off, and a clock left on the wrong half of the day 12 more."""
 MOST_NAMED = 20
 """Stills or events named in a note; the table has them all."""
 
@@ -268,6 +270,7 @@ def match_notes(matches: ExposureMatches) -> tuple[str, ...]:
         names = [entry.still for entry in matches.stills if entry.state is state]
         if names:
             notes.append(f"{len(names)} stills {what}: {_named(names)}")
+    notes += _doubtful_dates(matches)
     without = [entry.still for entry in matched if entry.position is None]
     if without:
         notes.append(f"{len(without)} stills matched, but the logs tell no position then: {_named(without)}")
@@ -275,6 +278,15 @@ def match_notes(matches: ExposureMatches) -> tuple[str, ...]:
     if len(matches.unused) > MOST_NAMED:
         notes.append(f"{len(matches.unused) - MOST_NAMED} more exposures are not used: see ingest/exposures.csv")
     return tuple(notes)
+
+
+def _doubtful_dates(matches: ExposureMatches) -> list[str]:
+    return [
+        f"the dates of {len(clock.stills)} stills from {clock.stills[0]} on are {abs(clock.offset_s) / 86_400.0:.0f} days "
+        "from those of the logs: the camera's date was wrong, or the logs are of another flight of the same pattern"
+        for clock in matches.clocks
+        if abs(clock.offset_s) > OTHER_DAY_S
+    ]
 
 
 def _named(names: Sequence[str]) -> str:
