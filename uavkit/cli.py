@@ -229,12 +229,12 @@ def ingest(
     pixel_origin: PixelsFrom = None,
     lever_arm: LeverArm = "0,0,0",
     shutter_latency: Annotated[
-        float, typer.Option(help="From an exposure event of a log to the exposure, s.", min=-60.0, max=60.0)
+        float, typer.Option(help="From an exposure event of a log to the exposure, s.", min=-10.0, max=10.0)
     ] = 0.0,
     latency_sigma: Annotated[
         float,
         typer.Option(
-            help="How far that may be off, s: the adjustment estimates the rest; 0 holds it.", min=0.0, max=60.0
+            help="How far that may be off, s: the adjustment estimates the rest; 0 holds it.", min=0.0, max=10.0
         ),
     ] = 0.1,
 ) -> None:
