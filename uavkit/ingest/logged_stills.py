@@ -283,7 +283,7 @@ def match_notes(matches: ExposureMatches) -> tuple[str, ...]:
 def _doubtful_dates(matches: ExposureMatches) -> list[str]:
     return [
         f"the dates of {len(clock.stills)} stills from {clock.stills[0]} on are {abs(clock.offset_s) / 86_400.0:.0f} "
-        "days from those of the logs: the camera's date was wrong, or the logs are of another flight of the same pattern"
+        "days from those of the logs: the camera's date was wrong, or they are of another flight of the same pattern"
         for clock in matches.clocks
         if abs(clock.offset_s) > OTHER_DAY_S
     ]
