@@ -203,6 +203,28 @@ def test_the_clock_tells_gps_times_of_camera_times():
     assert clock.residual_s < 0.01
 
 
+def test_a_strong_drift_over_a_long_flight():
+    """150 ppm over half an hour: half a pair's noise at the wrong sign would be 0.3 s at either end."""
+    times = flight(500, seed=8)
+    stills = still_stamps(times * (1.0 - 150e-6) + 3600.0, 0.01)
+    result = match_exposures(stills, exposure_stamps(times))
+    assert len(result.used()) >= 498
+    assert np.array_equal(result.event[result.used()], result.used())
+    (clock,) = result.clocks
+    assert abs(clock.drift_ppm + 150.0) < 4.0 * clock.sigma_drift_ppm
+    apart_s = (clock.gps_ns(stills.time_ns) - GPS0_NS) * 1e-9 - times
+    assert np.all(np.abs(apart_s + 0.005) < 0.012)
+
+
+def test_a_run_in_which_nearly_nothing_fits_is_left_open():
+    """Most stills without event and most events without still: rates stay rates."""
+    rng = np.random.default_rng([20007, 3, 1, 1000])
+    law = draw_law(rng, hover=True, resolution_s=1.0)
+    case = draw_case(rng, law, int(np.exp(rng.uniform(np.log(30), np.log(1000)))))
+    result = match_exposures(*stamps_of(case))
+    assert np.all((result.probability >= 0.0) & (result.probability <= 1.0 + 1e-9))
+
+
 def test_doubled_false_and_lone_events_are_named_with_their_reasons():
     times = flight()
     events = np.sort(np.concatenate([times, [times[20] + 0.15], [0.5 * (times[40] + times[41])]]))

@@ -32,6 +32,8 @@ LEAST_HALF_S = 0.5e-3
 
 RATE_STRENGTH = 20.0
 """As if the rates a priori came from so many exposures."""
+GREATEST_RATE = 0.3
+"""A flight of which more than this is amiss is one that does not match."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -199,7 +201,7 @@ def rates_seen(chain: Chain, alone: tuple[Array, Array], none: tuple[Array, Arra
     prior, rates = PRIOR_RATES, chain.rates
 
     def rate(before: float, count: float) -> float:
-        return (RATE_STRENGTH * before + count) / exposures
+        return min((RATE_STRENGTH * before + count) / exposures, GREATEST_RATE)
 
     again = []
     for times_s, resolution, share, false in (
