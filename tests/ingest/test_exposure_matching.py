@@ -348,6 +348,16 @@ def test_sums_too_small_to_be_told_are_no_sums():
     assert int(is_wrong(case, result.event, matched).sum()) <= 1
 
 
+def test_a_nearly_constant_hover_is_not_settled_by_chance():
+    """Intervals constant to 6 ms, noise of 24 ms: chance makes a wrong shift some thousand times likelier."""
+    rng = np.random.default_rng([20017, 12, 1, 10])
+    law = draw_law(rng, hover=True, resolution_s=0.01)
+    case = draw_case(rng, law, int(np.exp(rng.uniform(np.log(30), np.log(1000)))))
+    result = match_exposures(*stamps_of(case))
+    matched = np.array([state is StillState.MATCHED for state in result.state])
+    assert int(is_wrong(case, result.event, matched).sum()) == 0
+
+
 def test_a_long_hover_of_which_the_votes_name_only_wrong_shifts():
     """900 regular exposures and stamps of 1 s: the true shift is found from its neighbours, or all is left open."""
     rng = np.random.default_rng([9002, 13, 1, 1000])

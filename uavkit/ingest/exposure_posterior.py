@@ -27,7 +27,7 @@ LOG_NO_RELATION = float(np.log(NO_RELATION / (1.0 - NO_RELATION)))
 HOPELESS = 0.9
 """A shift less probable than this is of no use."""
 SHARE_TO_GO_ON = 0.5
-SHIFT_TRUST, SHIFT_TRUST_COARSE = 1.0, 0.75
+SHIFT_TRUST = 0.7
 """Odds between shifts, and against no relation, are taken to this power: that the law of intervals and the rates of
 defects are estimates is an error that all pairs of a shift have in common."""
 LEAST_SHARE, LEAST_SHARE_IF_OPEN = 1e-5, 0.02
@@ -84,7 +84,7 @@ def posterior(chain: Chain, limits: ClockLimits) -> Posterior | None:
             continue
         regions.append(region)
         grids.append(grid)
-        if _open_already(regions, chain):
+        if _open_already(regions):
             break
     return _summed(chain, regions, limits) if regions else None
 
@@ -113,9 +113,9 @@ def _at_their_best(chain: Chain, modes: list[WeighedClock], limits: ClockLimits)
     return [e for e in sorted(found, key=lambda e: -e.log_sum) if e.log_sum > top - NEAR_BEST]
 
 
-def _open_already(regions: list[_Region], chain: Chain) -> bool:
+def _open_already(regions: list[_Region]) -> bool:
     """Tell whether no region can be the only one any more: then the others need not be looked at."""
-    return bool(_shares(regions, chain)[:-1].max() < HOPELESS)
+    return bool(_shares(regions)[:-1].max() < HOPELESS)
 
 
 class _Grid:
@@ -184,18 +184,17 @@ class _Grid:
         return float(np.log(max(share, 1e-12)) + np.log(self._step_s / max(high - low, self._step_s)))
 
 
-def _shares(regions: list[_Region], chain: Chain) -> Array:
+def _shares(regions: list[_Region]) -> Array:
     """Return the probability of each region, and of no relation (the last)."""
     logs = np.array([float(np.logaddexp.reduce(region.log_weights)) for region in regions] + [LOG_NO_RELATION])
-    trust = SHIFT_TRUST_COARSE if chain.coarse else SHIFT_TRUST
-    weights = np.exp(trust * (logs - logs.max()))
+    weights = np.exp(SHIFT_TRUST * (logs - logs.max()))
     return np.asarray(weights / weights.sum(), dtype=np.float64)
 
 
 def _summed(chain: Chain, regions: list[_Region], limits: ClockLimits) -> Posterior:
     """Return the mean over all settings by their weights."""
     n, m = len(chain.still_s), len(chain.event_s)
-    shares = _shares(regions, chain)
+    shares = _shares(regions)
     least = LEAST_SHARE if float(shares[:-1].max()) > HOPELESS else LEAST_SHARE_IF_OPEN
     keys, values = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
     again, copy = np.zeros(m), np.zeros(n)
