@@ -61,14 +61,15 @@ def read_matches(path: Path) -> tuple[MatchRow, ...]:
     return tuple(rows)
 
 
-def write_matches(path: Path, rows: Sequence[MatchRow]) -> None:
-    """Write the CSV, whole or not at all."""
+def write_matches(path: Path, rows: Sequence[MatchRow], remarks: Sequence[str] = ()) -> None:
+    """Write the CSV, whole or not at all; remarks stand at its end as comments, which are not read."""
     stream = io.StringIO()
     stream.write("# uavkit match\n")
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(COLUMNS)
     for row in rows:
         writer.writerow([getattr(row, name) for name in COLUMNS])
+    stream.writelines(f"# {' '.join(remark.split())}\n" for remark in remarks)
     write_text(path, stream.getvalue())
 
 

@@ -470,7 +470,7 @@ class _Run:
 
 
 def offset_in_words(offset_s: float) -> str:
-    """Return "9 h 0 min 2.3 s ahead of GPS time: it runs on local time" or the like."""
+    """Return "9 h 0 min 2.3 s ahead of UTC: it runs on local time" or the like."""
     size = abs(offset_s)
     days, rest = divmod(size, 86_400.0)
     hours, rest = divmod(rest, 3600.0)
@@ -478,5 +478,5 @@ def offset_in_words(offset_s: float) -> str:
     parts = [(f"{days:.0f} d", days), (f"{hours:.0f} h", days + hours), (f"{minutes:.0f} min", days + hours + minutes)]
     text = " ".join([part for part, shown in parts if shown] + [f"{seconds:.1f} s"])
     local = 1500.0 < size < 15 * 3600.0 and abs(size - 900.0 * round(size / 900.0)) < 180.0
-    where = f"{text} {'ahead of' if offset_s > 0 else 'behind'} GPS time"
+    where = f"{text} {'ahead of' if offset_s > 0 else 'behind'} UTC"
     return where + (": it runs on local time" if local else "")

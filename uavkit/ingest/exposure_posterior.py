@@ -27,7 +27,7 @@ LOG_NO_RELATION = float(np.log(NO_RELATION / (1.0 - NO_RELATION)))
 HOPELESS = 0.9
 """A shift less probable than this is of no use."""
 SHARE_TO_GO_ON = 0.5
-SHIFT_TRUST = 0.7
+SHIFT_TRUST = 0.75
 """Odds between shifts, and against no relation, are taken to this power: that the law of intervals and the rates of
 defects are estimates is an error that all pairs of a shift have in common."""
 LEAST_SHARE, LEAST_SHARE_IF_OPEN = 1e-5, 0.02
