@@ -369,6 +369,7 @@ def geotag(
     with progress_shown() as progress:
         found = workflow.geotag(project, out, None if positions is None else positions == "measured", progress)
     _say([f"no position, no copy: {name}: {reason}" for name, reason in found.without.items()])
+    _say([f"note: {note}" for note in found.notes])
     typer.echo(f"{len(found.tags)} stills with their positions: {out}")
 
 
@@ -398,15 +399,13 @@ def log_info(
 def log_export(
     file: Annotated[Path, typer.Argument(help="A flight log of any kind.", show_default=False)],
     to: Annotated[Literal["csv", "kml", "gpx", "parquet"], typer.Option(help="Format.", show_default=False)],
-    out: Annotated[
-        Path | None, typer.Option(help="Folder to write to; else a new one beside you, named after the log.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder to write to; else NAME_export here, after the log.")] = None,
 ) -> None:
     """Write positions, attitudes and exposures of a log for other programs."""
     from uavkit import workflow
 
     with progress_shown() as progress:
-        written = workflow.export_log(file, to, out or Path(file.stem), progress)
+        written = workflow.export_log(file, to, out or Path(f"{file.name}_export"), progress)
     _say([str(path) for path in written])
 
 

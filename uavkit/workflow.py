@@ -162,8 +162,10 @@ def ingest(project: Project, progress: Progress = silent) -> Block:
 
     with project.running(Stage.INGEST):
         block = _built_block(project, progress)
+        (project.stage_folder(Stage.INGEST) / MATCHES).unlink(missing_ok=True)
         if block.exposures is not None:
-            write_matches(project.stage_folder(Stage.INGEST) / MATCHES, rows_of_matches(block.exposures))
+            unused = [f"not used {event.source} - {event.reason}" for event in block.exposures.unused]
+            write_matches(project.stage_folder(Stage.INGEST) / MATCHES, rows_of_matches(block.exposures), unused)
         write_block(project.block_file, block)
     return block
 
@@ -323,6 +325,12 @@ def geotag(project: Project, out: Path, measured: bool | None, progress: Progres
         _require(project, Stage.PROCESS)
     use_adjusted = adjusted if measured is None else not measured
     found = adjusted_tags(oriented_block(project)) if use_adjusted else measured_tags(read_block(project.block_file))
+    left = [name for name in found.without if (out / name).exists()]
+    if left:
+        raise InputError(
+            f"{out / left[0]}: this copy is from before, and the still has no position now: empty {out}, or name "
+            "another folder"
+        )
     for done, (name, tag) in enumerate(sorted(found.tags.items())):
         progress("geotag", done, len(found.tags))
         write_geotagged(stills.path(name), out / name, tag)

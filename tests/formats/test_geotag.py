@@ -543,7 +543,6 @@ def test_a_still_cut_short_within_its_pixels_is_copied_as_it_is(tmp_path: Path) 
         {"longitude_deg": float("nan")},
         {"height_m": float("inf")},
         {"height_datum": HeightDatum.GROUND},
-        {"height_datum": HeightDatum.UNKNOWN},
         {"gps_time_ns": -1},
         {"sigma_horizontal_m": 0.0},
         {"sigma_vertical_m": float("nan")},

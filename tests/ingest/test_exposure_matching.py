@@ -303,9 +303,9 @@ def test_options_are_checked():
 @pytest.mark.parametrize(
     "offset_s, words",
     [
-        (32_402.3, "9 h 0 min 2.3 s ahead of GPS time: it runs on local time"),
-        (-0.25, "0.2 s behind GPS time"),
-        (-90_000.0, "1 d 1 h 0 min 0.0 s behind GPS time"),
+        (32_402.3, "9 h 0 min 2.3 s ahead of UTC: it runs on local time"),
+        (-0.25, "0.2 s behind UTC"),
+        (-90_000.0, "1 d 1 h 0 min 0.0 s behind UTC"),
     ],
 )
 def test_the_offset_in_words(offset_s, words):

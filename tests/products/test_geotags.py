@@ -7,10 +7,10 @@ import pytest
 
 from tests.report.conftest import make_result_
 from uavkit.core.adjustment import Datum
+from uavkit.core.block import Block, PositionFacts, PositionSource
 from uavkit.core.exposures import ExposureMatches, StillExposure, StillState
 from uavkit.core.heights import HeightDatum
 from uavkit.core.observations import GnssObservations
-from uavkit.core.records import GnssFix
 from uavkit.core.result import OrientedBlock
 from uavkit.products.geotags import adjusted_tags, measured_tags
 
@@ -43,26 +43,31 @@ def test_a_free_network_lies_nowhere(result: OrientedBlock) -> None:
     assert all("free network" in reason for reason in found.without.values())
 
 
-def measured(result: OrientedBlock, up_sigma_m: float = 0.2) -> OrientedBlock:
+def measured(result: OrientedBlock, **facts: object) -> Block:
     """The block with positions of its first two stills, the second one's matched with an exposure."""
     names = [still.name for still in result.block.stills]
     gnss = GnssObservations(
         image_index=np.array([0, 1]),
         position_m=np.array([[1.0, 2.0, 30.0], [4.0, 6.0, 31.0]]),
-        sigma_m=np.array([[0.3, 0.4, up_sigma_m]] * 2),
+        sigma_m=np.array([[0.3, 0.4, 0.2]] * 2),
         flight=np.zeros(2, dtype=np.int64),
     )
     entries = (
         StillExposure(still=names[1], state=StillState.MATCHED, probability=0.9995, event=1, gps_time_ns=10**18),
         StillExposure(still=names[2], state=StillState.AMBIGUOUS, probability=0.6, reason="ambiguous: 2 or 3"),
     )
+    known = PositionFacts(
+        source=PositionSource.LOG,
+        height_datum=HeightDatum.GEOID,
+        probability=np.array([1.0, 0.9995]),
+        sigma_stated=np.array([True, True]),
+    )
     matches = ExposureMatches(sources=("flight.BIN",), stills=entries, unused=(), events=3, clocks=())
-    stills = tuple(replace(still, position=None) for still in result.block.stills)
-    return replace(result, block=replace(result.block, gnss=gnss, exposures=matches, stills=stills))
+    return replace(result.block, gnss=gnss, exposures=matches, positions=replace(known, **facts))
 
 
 def test_measured_tags_are_positions_with_time_and_probability(result: OrientedBlock) -> None:
-    block = measured(result).block
+    block = measured(result)
     found = measured_tags(block)
     names = [still.name for still in block.stills]
     assert set(found.tags) == {names[0], names[1]}
@@ -70,22 +75,23 @@ def test_measured_tags_are_positions_with_time_and_probability(result: OrientedB
     assert (tag.gps_time_ns, tag.probability, tag.height_datum) == (10**18, 0.9995, HeightDatum.ELLIPSOID)
     assert tag.sigma_horizontal_m == pytest.approx(np.sqrt(0.5 * (0.09 + 0.16)))
     assert found.without[names[2]] == "ambiguous: 2 or 3"
+    assert "flight logs" in found.notes[0]
 
 
-def test_heights_that_ingest_did_not_get_are_not_written(result: OrientedBlock) -> None:
-    found = measured_tags(measured(result, up_sigma_m=100.0).block)
-    assert all(np.isnan(tag.height_m) and tag.sigma_vertical_m is None for tag in found.tags.values())
+def test_what_was_not_stated_is_not_written(result: OrientedBlock) -> None:
+    ground = measured_tags(measured(result, height_datum=HeightDatum.GROUND)).tags.values()
+    assert all(np.isnan(tag.height_m) and tag.sigma_vertical_m is None for tag in ground)
+    bare = measured_tags(measured(result, source=PositionSource.EXIF, sigma_stated=np.zeros(2, dtype=np.bool_)))
+    assert all(tag.sigma_horizontal_m is None and tag.probability is None for tag in bare.tags.values())
 
 
-def test_a_stills_own_height_of_unknown_datum_stays_as_it_is(result: OrientedBlock) -> None:
-    block = measured(result).block
-    assert block.gnss is not None
-    assert block.frame is not None
-    place = block.frame.geographic_from_enu(block.gnss.position_m)[0]
-    own = GnssFix(
-        gps_time_ns=None, latitude_deg=float(place[0]), longitude_deg=float(place[1]), height_m=198.3,
-        height_datum=HeightDatum.UNKNOWN,
-    )  # fmt: skip
-    stills = (replace(block.stills[0], position=own), *block.stills[1:])
-    tag = measured_tags(replace(block, stills=stills)).tags[block.stills[0].name]
-    assert (tag.height_m, tag.height_datum) == (198.3, HeightDatum.GEOID)
+def test_heights_of_unknown_datum_stay_as_they_are_in_both_kinds_of_tags(result: OrientedBlock) -> None:
+    block = measured(result, height_datum=HeightDatum.UNKNOWN)
+    assert {tag.height_datum for tag in measured_tags(block).tags.values()} == {HeightDatum.UNKNOWN}
+    free_of_control = replace(result.adjustment, control_used=np.zeros_like(result.adjustment.control_used))
+    adjusted = adjusted_tags(replace(result, block=block, adjustment=free_of_control))
+    assert {tag.height_datum for tag in adjusted.tags.values()} == {HeightDatum.UNKNOWN}
+    assert any("--height-datum" in note for note in adjusted.notes)
+    tag = next(iter(adjusted.tags.values()))
+    assert tag.heights_m[0] == tag.height_m
+    assert np.isnan(tag.heights_m[1])

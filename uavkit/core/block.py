@@ -1,11 +1,14 @@
 """The block: what ingest hands to process."""
 
 from dataclasses import dataclass
+from enum import Enum
 
+from uavkit.core.arrays import Array, Flags
 from uavkit.core.camera import CameraProfile, InteriorOrientation
 from uavkit.core.errors import InputError
 from uavkit.core.exposures import ExposureMatches
 from uavkit.core.frames import LocalFrame
+from uavkit.core.heights import HeightDatum
 from uavkit.core.observations import GnssObservations
 from uavkit.core.points import CheckPoint, ControlPoint
 from uavkit.core.records import FieldOrder, StillInfo
@@ -46,6 +49,27 @@ class VideoSync:
     """First frames of shutter events that belong to no still."""
 
 
+class PositionSource(Enum):
+    """Where the positions of the stills come from."""
+
+    LISTED = "a list of positions"
+    LOG = "flight logs"
+    EXIF = "the stills' own files"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PositionFacts:
+    """What is known of all positions of a block together."""
+
+    source: PositionSource
+    height_datum: HeightDatum
+    """As given; the block itself counts all heights from the ellipsoid."""
+    probability: Array
+    """(g,) that the position belongs to its still; 1 where names or the files themselves tell."""
+    sigma_stated: Flags
+    """(g,) whether the source states the accuracy; else a usual one is taken."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Block:
     """Stills of one camera with everything observed of them but their contents."""
@@ -57,6 +81,8 @@ class Block:
     frame: LocalFrame | None
     """None where nothing tells where on earth the block lies."""
     gnss: GnssObservations | None = None
+    positions: PositionFacts | None = None
+    """Of ``gnss``; None without it."""
     control_points: tuple[ControlPoint, ...] = ()
     check_points: tuple[CheckPoint, ...] = ()
     video: VideoSync | None = None

@@ -33,8 +33,9 @@ class StillExposure:
     """Number of the event among those of all logs, from 1."""
     label: str = ""
     """What the user knows the event by: its log and its number there."""
+    event_gps_time_ns: int | None = None
     gps_time_ns: int | None = None
-    """Of the exposure, the shutter's configured latency included."""
+    """Of the exposure: the event's, and the shutter's stated latency."""
     position: GnssFix | None = None
     """Of the antenna (or, where a lever arm was taken off, of the projection centre) at that time."""
     reason: str = ""
@@ -58,7 +59,7 @@ class CameraClock:
     stills: tuple[str, ...]
     reference_gps_ns: int
     offset_s: float
-    """Camera's clock (read as UTC) minus GPS time at the reference."""
+    """What the camera's clock shows minus UTC, at the reference."""
     offset_sigma_s: float
     drift_ppm: float
     drift_sigma_ppm: float
@@ -77,3 +78,7 @@ class ExposureMatches:
     events: int
     """Number of all events."""
     clocks: tuple[CameraClock, ...]
+    shutter_latency_s: float = 0.0
+    """From event to exposure, as the user stated it."""
+    lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """From the camera to the antenna, forward, right, down, as the user stated it."""

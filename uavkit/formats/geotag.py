@@ -69,7 +69,7 @@ class GeoTag:
     height_m: float
     """NaN where unknown: then no height is written."""
     height_datum: HeightDatum
-    """GEOID or ELLIPSOID."""
+    """GEOID, ELLIPSOID, or UNKNOWN: then the height is written as it is, and nothing said of what it counts from."""
     gps_time_ns: int | None = None
     """Of the exposure; None leaves the still's own GPS time, if any, as it is."""
     sigma_horizontal_m: float | None = None
@@ -85,7 +85,7 @@ class GeoTag:
             raise ValueError(f"no such place: latitude {self.latitude_deg}, longitude {self.longitude_deg} degrees")
         if np.isinf(self.height_m) or abs(self.height_m) > 1e6:
             raise ValueError(f"no such height: {self.height_m} m")
-        if not np.isnan(self.height_m) and self.height_datum not in (HeightDatum.GEOID, HeightDatum.ELLIPSOID):
+        if not np.isnan(self.height_m) and self.height_datum is HeightDatum.GROUND:
             raise ValueError(f"a {self.height_datum.value} height cannot be written as a height above sea level")
         if self.gps_time_ns is not None and self.gps_time_ns < 0:
             raise ValueError(f"GPS time {self.gps_time_ns} ns lies before 1980")
@@ -98,9 +98,12 @@ class GeoTag:
 
     @property
     def heights_m(self) -> tuple[float, float]:
-        """Return the height above the EGM96 geoid and above the ellipsoid, metres; NaN where unknown."""
-        if np.isnan(self.height_m):
-            return float("nan"), float("nan")
+        """Return the height for EXIF (above the EGM96 geoid; of unknown datum as it is) and that above the ellipsoid.
+
+        Metres; NaN where unknown.
+        """
+        if np.isnan(self.height_m) or self.height_datum is HeightDatum.UNKNOWN:
+            return self.height_m, float("nan")
         undulation = float(geoid_undulation_m(np.array([self.latitude_deg]), np.array([self.longitude_deg]))[0])
         if self.height_datum is HeightDatum.GEOID:
             return self.height_m, self.height_m + undulation

@@ -10,6 +10,8 @@ from uavkit.core.gpstime import NO_TIME, utc_from_gps_time_ns
 
 MOST_SPANS_TOLD = 5
 MOST_KINDS_TOLD = 40
+LONG_GAP_S, LONG_GAP_STEPS = 2.0, 10.0
+"""Longer times without a fix, and so many usual intervals, are told."""
 
 
 def log_summary(log: FlightLog) -> dict[str, Any]:
@@ -33,13 +35,32 @@ def log_summary(log: FlightLog) -> dict[str, Any]:
         "damage": {
             "lost_bytes": log.damage.lost_bytes,
             "places": log.damage.span_count,
-            "first": [
-                {"offset": span.offset, "length": span.length, "why": span.why}
-                for span in log.damage.spans[:MOST_SPANS_TOLD]
-            ],
+            "spans": [{"offset": span.offset, "length": span.length, "why": span.why} for span in log.damage.spans],
         },
-        "notes": list(log.notes),
+        "notes": [*log.notes, *_missing(log)],
     }
+
+
+def _missing(log: FlightLog) -> list[str]:
+    """Return what seems to be cut out of a log: numbers of exposures, and times without fixes."""
+    notes = []
+    numbers = log.exposure_table.sequence[log.exposure_table.sequence >= 0]
+    if len(numbers) > 1:
+        absent = np.setdiff1d(np.arange(numbers.min(), numbers.max()), numbers)
+        if 0 < len(absent) <= len(numbers):
+            shown = ", ".join(map(str, absent[:MOST_SPANS_TOLD].tolist())) + (
+                ", ..." if len(absent) > MOST_SPANS_TOLD else ""
+            )
+            notes.append(f"{len(absent)} exposures are missing by their numbers: {shown}")
+    table = log.fix_table
+    times = np.unique(_known(table.when.gps_ns[table.receiver == table.receiver.min(initial=255)]))
+    steps_s = np.diff(times) * 1e-9
+    if len(steps_s) > 10:
+        longest = int(np.argmax(steps_s))
+        if steps_s[longest] > max(LONG_GAP_S, LONG_GAP_STEPS * float(np.median(steps_s))):
+            begin, end = _utc(int(times[longest])), _utc(int(times[longest + 1]))
+            notes.append(f"no fixes for {steps_s[longest]:.1f} s, {begin} to {end}")
+    return notes
 
 
 def _known(when_ns: Indices) -> Indices:
@@ -131,9 +152,12 @@ def summary_lines(log: FlightLog) -> list[str]:
     lines.append(f"attitudes {told['attitudes']}")
     lines.append(_exposure_line(told["exposures"]))
     lines.append(_damage_line(told["damage"]))
-    lines += [f"          at byte {s['offset']}: {s['length']} bytes, {s['why']}" for s in told["damage"]["first"]]
+    spans = told["damage"]["spans"]
+    lines += [f"          at byte {s['offset']}: {s['length']} bytes, {s['why']}" for s in spans[:MOST_SPANS_TOLD]]
+    if told["damage"]["places"] > MOST_SPANS_TOLD:
+        lines.append(f"          and {told['damage']['places'] - MOST_SPANS_TOLD} more places")
     lines += _message_lines(told["messages"])
-    return [line for line in lines if line] + [f"note: {note}" for note in log.notes]
+    return [line for line in lines if line] + [f"note: {note}" for note in told["notes"]]
 
 
 def _duration(seconds: float) -> str:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from uavkit.core.arrays import Array
-from uavkit.core.block import Block, VideoSync
+from uavkit.core.block import Block, PositionFacts, PositionSource, VideoSync
 from uavkit.core.camera import CameraProfile
 from uavkit.core.devices import GnssReceiver, StillSource, VideoSource
 from uavkit.core.errors import InputError
@@ -22,7 +22,7 @@ from uavkit.formats.positions_file import ImagePositions
 from uavkit.ingest.control import MarkedPoints, height_notes, local_points, match_marks
 from uavkit.ingest.log_positions import LogOptions, listed_fixes
 from uavkit.ingest.logged_stills import GivenMatches, LoggedStills, stills_in_logs
-from uavkit.ingest.planned import join_planned, planned_notes
+from uavkit.ingest.planned import planned_notes
 from uavkit.ingest.positions import (
     JoinedPositions,
     PositionOptions,
@@ -56,7 +56,7 @@ class Sources:
     given: GivenMatches = field(default_factory=GivenMatches)
     """What the user says of stills and exposures."""
     planned: tuple[GnssFix, ...] = ()
-    """Where the plan takes pictures: told against what was taken, and used where nothing else tells positions."""
+    """Where the plan takes pictures: told against what was taken."""
     control: SurveyedPoints | None = None
     check: SurveyedPoints | None = None
 
@@ -162,7 +162,7 @@ def _positions(
     logged: LoggedStills,
     options: IngestOptions,
 ) -> JoinedPositions:
-    """Return listed positions, else those of logs, of EXIF, of the plan; with the height datum that counts."""
+    """Return listed positions, else those of logs, of EXIF; with the height datum that counts."""
     joined = _best_positions(sources, stills, absent, logged, options)
     if sources.planned:
         joined = replace(joined, notes=(*joined.notes, *planned_notes(sources.planned, joined)))
@@ -183,9 +183,8 @@ def _best_positions(
     if joined is not None and joined.count:
         return joined
     notes, discarded = (joined.notes, joined.discarded) if joined is not None else ((), ())
-    found = logged.joined if logged.joined.count else exif_positions(stills)
-    if not found.count and sources.planned:
-        found = join_planned(stills, sources.planned, absent, options.positions)
+    from_log = replace(logged.joined, source=PositionSource.LOG)
+    found = from_log if logged.joined.count else exif_positions(stills)
     return replace(found, notes=(*notes, *found.notes), discarded=(*discarded, *found.discarded))
 
 
@@ -284,7 +283,13 @@ def _with_positions(
         velocity_m_s=velocity,
         latency_sigma_s=options.latency_sigma_s if velocity is not None and options.latency_sigma_s > 0 else None,
     )
-    return replace(block, gnss=gnss, notes=(*block.notes, *notes))
+    facts = PositionFacts(
+        source=joined.source,
+        height_datum=datum,
+        probability=joined.probability[rows],
+        sigma_stated=np.array([fix.sigma_horizontal_m is not None for fix in fixes], dtype=np.bool_),
+    )
+    return replace(block, gnss=gnss, positions=facts, notes=(*block.notes, *notes))
 
 
 def _lever_arm(

@@ -23,6 +23,7 @@ from uavkit.ingest.trajectory import Trajectory, build_trajectory
 
 LEAST_DELAY_SIGMAS = 3.0
 """A delay that its own scatter may explain is not applied."""
+LONGEST_ARM_M = 10.0
 LONGEST_DELAY_S = 1.0
 """No receiver's message takes longer: such a value tells of other clocks."""
 
@@ -35,6 +36,12 @@ class LogOptions:
     """Antenna minus camera in the vehicle's axes: forward, right, down."""
     shutter_latency_s: float = 0.0
     """From the event to the exposure."""
+
+    def __post_init__(self) -> None:
+        if not max(map(abs, self.lever_arm_m)) <= LONGEST_ARM_M:
+            raise InputError(
+                f"a lever arm of {self.lever_arm_m}: forward, right, down in metres, at most {LONGEST_ARM_M:g}"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,7 +139,9 @@ def _span(flight: LoggedFlight) -> tuple[float, float]:
 class EventPosition:
     """Where the antenna (the camera, if a lever arm was taken off) was at an exposure."""
 
+    event_gps_time_ns: int
     gps_time_ns: int
+    """Of the exposure."""
     fix: GnssFix | None
     velocity_m_s: tuple[float, float, float] | None
     flight: int
@@ -157,10 +166,14 @@ def positions_of_events(
         others = [other for other in flights if other is not flight and other.number == flight.number]
         logged = list(flight.log.exposures())
         for n, time_ns, place in zip(mine, times.tolist(), _places([flight, *others], times, options), strict=True):
-            found = place or _as_logged(logged[events[n][1]])
-            fix, velocity, reason = found
+            fix, velocity, reason = place or _as_logged(logged[events[n][1]], options)
             result[n] = EventPosition(
-                gps_time_ns=time_ns, fix=fix, velocity_m_s=velocity, flight=flight.number, reason=reason
+                event_gps_time_ns=events[n][2],
+                gps_time_ns=time_ns,
+                fix=fix,
+                velocity_m_s=velocity,
+                flight=flight.number,
+                reason=reason,
             )
     return _of_one_datum([result[n] for n in range(len(events))])
 
@@ -207,8 +220,10 @@ def _velocity(velocity_m_s: Array) -> tuple[float, float, float] | None:
     return (east, north, up) if np.isfinite([east, north, up]).all() else None
 
 
-def _as_logged(event: ExposureEvent) -> _Place:
-    """Return the position that the event itself tells, if any."""
+def _as_logged(event: ExposureEvent, options: LogOptions) -> _Place:
+    """Return the position that the event itself tells, if any, and if nothing has to move it along a track."""
+    if options.shutter_latency_s or any(options.lever_arm_m):
+        return None, None, "the track does not reach it, along which latency and lever arm would move it"
     if event.position is not None:
         return event.position, None, ""
     return None, None, "the log tells no position at that time"

@@ -92,12 +92,27 @@ def stills_in_logs(
         unused=_unused(merged, found),
         events=len(merged.stamps.gps_ns),
         clocks=tuple(_clock(clock, infos) for clock in found.clocks if clock.settled),
+        shutter_latency_s=options.shutter_latency_s,
+        lever_arm_m=options.lever_arm_m,
     )
-    notes += [*merged.notes, *found.notes, *match_notes(matches)]
+    notes += [*merged.notes, *found.notes, *_option_notes(options), *match_notes(matches)]
     joined = _joined(matches, places, len(infos))
     return LoggedStills(
         matches=matches, joined=joined, notes=tuple(notes), lever_arm_taken_off=turned_by_attitude(flights)
     )
+
+
+def _option_notes(options: LogOptions) -> list[str]:
+    """Return what was stated of shutter and antenna, so that a wrong unit is seen."""
+    notes = []
+    if options.shutter_latency_s:
+        notes.append(f"shutter latency as stated: exposures {1e3 * options.shutter_latency_s:g} ms after their events")
+    if any(options.lever_arm_m):
+        forward, right, down = options.lever_arm_m
+        notes.append(
+            f"antenna as stated: {forward:g} m ahead of the camera, {right:g} m to its right, {down:g} m below it"
+        )
+    return notes
 
 
 def _nothing(count: int) -> JoinedPositions:
@@ -198,6 +213,7 @@ def _still(
         probability=float(found.probability[row]) if named else 0.0,
         event=event + 1 if named else None,
         label=merged.stamps.label[event] if named else "",
+        event_gps_time_ns=None if place is None else place.event_gps_time_ns,
         gps_time_ns=None if place is None else place.gps_time_ns,
         position=None if fix is None else replace(fix, name=info.name),
         reason=found.reason[row] or ("" if place is None else place.reason),
@@ -262,8 +278,12 @@ def match_notes(matches: ExposureMatches) -> tuple[str, ...]:
     """Return in words how many stills and events belong together, and what is left open."""
     matched = [entry for entry in matches.stills if entry.position is not None or entry.gps_time_ns is not None]
     notes = [f"{len(matched)} of {len(matches.stills)} stills matched with {matches.events} exposures of the logs"]
+    if any(entry.state is StillState.AMBIGUOUS for entry in matches.stills):
+        notes.append(
+            "to decide what is ambiguous: fill 'event' in a copy of ingest/exposures.csv and give it as --match"
+        )
     for state, what in (
-        (StillState.AMBIGUOUS, "ambiguous, their positions are not used"),
+        (StillState.AMBIGUOUS, "ambiguous, their exposures are not used"),
         (StillState.NO_EVENT, "without an exposure in the logs"),
         (StillState.NO_TIME, "without a time"),
     ):
@@ -276,7 +296,9 @@ def match_notes(matches: ExposureMatches) -> tuple[str, ...]:
         notes.append(f"{len(without)} stills matched, but the logs tell no position then: {_named(without)}")
     notes += [f"exposure {entry.source} is not used: {entry.reason}" for entry in matches.unused[:MOST_NAMED]]
     if len(matches.unused) > MOST_NAMED:
-        notes.append(f"{len(matches.unused) - MOST_NAMED} more exposures are not used: see ingest/exposures.csv")
+        notes.append(
+            f"{len(matches.unused) - MOST_NAMED} more exposures are not used: see the end of ingest/exposures.csv"
+        )
     return tuple(notes)
 
 

@@ -1,33 +1,20 @@
-"""The plan of a flight against what was taken: stations without a still, and planned positions where no others are."""
+"""The plan of a flight against what was taken. Planned places are never used as positions: vehicles skip stations."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from uavkit.core.arrays import Array
 from uavkit.core.frames import LocalFrame
-from uavkit.core.records import GnssFix, StillInfo
-from uavkit.ingest.positions import JoinedPositions, PositionOptions, join_positions
+from uavkit.core.records import GnssFix
+from uavkit.ingest.positions import JoinedPositions
 
-PLANNED_SIGMA_M = 5.0
-"""Of a planned position as that of the still: vehicles cut corners and trigger late."""
 TAKEN_SHARE = 0.6
 """A station counts as taken if a still lies nearer than this share of the usual distance between stations."""
 ELSEWHERE_M = 500.0
 """A plan all of whose stations are farther from all stills is of another flight."""
 MOST_NAMED = 12
-
-
-def join_planned(
-    infos: Sequence[StillInfo], planned: Sequence[GnssFix], absent: Sequence[str], options: PositionOptions
-) -> JoinedPositions:
-    """Return planned positions as those of the stills, as far as order and distances settle them."""
-    rough = [replace(fix, sigma_horizontal_m=PLANNED_SIGMA_M, sigma_vertical_m=PLANNED_SIGMA_M) for fix in planned]
-    joined = join_positions(infos, rough, absent, options)
-    note = f"positions are those of the plan, with a sigma of {PLANNED_SIGMA_M:g} m: nothing tells better ones"
-    return replace(joined, notes=(note, *joined.notes))
 
 
 def planned_notes(planned: Sequence[GnssFix], joined: JoinedPositions) -> tuple[str, ...]:
@@ -47,9 +34,10 @@ def planned_notes(planned: Sequence[GnssFix], joined: JoinedPositions) -> tuple[
         )
     missed = [planned[n].name or str(n + 1) for n in np.flatnonzero(nearest_m > TAKEN_SHARE * usual_m).tolist()]
     if not missed:
-        return (f"{counted}; a still lies near each planned station",)
+        return (f"{counted}; a still with a position lies near each planned station",)
     named = ", ".join(missed[:MOST_NAMED]) + (", ..." if len(missed) > MOST_NAMED else "")
-    return (f"{counted}; no still lies near {len(missed)} planned stations: {named}",)
+    without = f" ({stills - len(fixes)} stills have no position)" if stills > len(fixes) else ""
+    return (f"{counted}; no still with a position{without} lies near {len(missed)} planned stations: {named}",)
 
 
 def _level(fixes: Sequence[GnssFix], frame: LocalFrame) -> Array:

@@ -14,6 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from uavkit.core.arrays import Array, Flags, Indices
+from uavkit.core.block import PositionSource
 from uavkit.core.errors import InputError
 from uavkit.core.frames import LocalFrame
 from uavkit.core.records import GnssFix, StillInfo
@@ -80,6 +81,7 @@ class JoinedPositions:
     """(n, 3) east, north, up of the antenna, NaN where unknown; None where nothing tells it."""
     flight: Indices | None = None
     """(n,) number of the flight; None: all are of one."""
+    source: PositionSource = PositionSource.LISTED
 
     @property
     def count(self) -> int:
@@ -126,7 +128,12 @@ def exif_positions(infos: Sequence[StillInfo]) -> JoinedPositions:
             notes.append(f"{len(without)} stills without EXIF position: {', '.join(without)}")
     probability = np.array([0.0 if fix is None else 1.0 for fix in fixes])
     return JoinedPositions(
-        fixes=tuple(fixes), probability=probability, from_exif=True, discarded=(), notes=tuple(notes)
+        fixes=tuple(fixes),
+        probability=probability,
+        from_exif=True,
+        discarded=(),
+        notes=tuple(notes),
+        source=PositionSource.EXIF,
     )
 
 
@@ -442,7 +449,11 @@ def _count_notes(
     slots: Sequence[_Slot], fixes: Sequence[GnssFix], pairs: dict[int, tuple[int, float]], how: str
 ) -> list[str]:
     if len(slots) == len(fixes):
-        return [f"{len(pairs)} positions joined with stills by {how}, the counts are equal"]
+        text = f"{len(pairs)} positions joined with stills by {how}, the counts are equal"
+        least = min((probability for _, probability in pairs.values()), default=1.0)
+        if least < CERTAIN and how.startswith("order"):
+            text += f"; the order alone gives a pair {least:.2f} at least: stills and positions may both be missing"
+        return [text]
     word = "fewer" if len(fixes) < len(slots) else "more"
     text = f"{len(fixes)} positions are {word} than {len(slots)} stills: {len(pairs)} joined by {how}"
     if len(pairs) < min(len(slots), len(fixes)):

@@ -33,7 +33,7 @@ def _expected(path: Path) -> tuple[GnssFix, ...]:
     if not name.endswith((".plan", ".waypoints", ".txt")):
         raise InputError(f"{path}: a plan is a table of exposures (.csv), .flightplan.json, .plan or .waypoints")
     found = exposures_of(read_plan(path) if name.endswith(".plan") else read_waypoints(path))
-    names = [f"exposure {number}" for number in range(1, len(found) + 1)]
+    names = [f"planned exposure {number}" for number in range(1, len(found) + 1)]
     return _fixes(found.latitude_deg.tolist(), found.longitude_deg.tolist(), names)
 
 

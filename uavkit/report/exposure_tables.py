@@ -19,7 +19,7 @@ def clock_table(matches: ExposureMatches) -> Table:
         )
         for clock in matches.clocks
     )
-    header = ("Stills", "Number", "Offset from GPS time [s]", "Drift [ppm]", "RMS residual [ms]")
+    header = ("Stills", "Number", "Offset from UTC [s]", "Drift [ppm]", "RMS residual [ms]")
     note = "Stamps of whole seconds leave residuals of 289 ms (rounding): that is no error." if rows else ""
     return Table(title="The camera's clock", header=header, rows=rows, note=note)
 
@@ -37,7 +37,7 @@ def exposures_table(matches: ExposureMatches) -> Table:
         )
         for entry in matches.stills
     )
-    header = ("Still", "State", "Exposure", "UTC", "Probability", "Remark")
+    header = ("Still", "State", "Exposure", "UTC of the exposure", "Probability", "Remark")
     return Table(title="Stills and their exposures", header=header, rows=rows, folded=len(rows) > COLLAPSE_ABOVE)
 
 
@@ -46,7 +46,7 @@ def unused_table(matches: ExposureMatches) -> Table:
     rows = tuple((entry.source, _clock_time(entry.gps_time_ns), entry.reason) for entry in matches.unused)
     return Table(
         title="Exposures without a still",
-        header=("Exposure", "UTC", "Reason"),
+        header=("Exposure", "UTC of the event", "Reason"),
         rows=rows,
         folded=len(rows) > COLLAPSE_ABOVE,
     )
@@ -60,7 +60,11 @@ def summary_sentence(matches: ExposureMatches) -> str:
     if count[StillState.GIVEN]:
         text += f" ({count[StillState.GIVEN]} of them as told by the user)"
     if count[StillState.AMBIGUOUS]:
-        text += f"; {count[StillState.AMBIGUOUS]} are ambiguous, and their positions are not used"
+        text += f"; {count[StillState.AMBIGUOUS]} are ambiguous, and their exposures are not used"
+    if matches.shutter_latency_s:
+        text += f". Shutter latency as stated: {1e3 * matches.shutter_latency_s:g} ms"
+    if any(matches.lever_arm_m):
+        text += ". Antenna from the camera, forward, right, down: {:g}, {:g}, {:g} m".format(*matches.lever_arm_m)
     return text + "."
 
 

@@ -12,8 +12,8 @@ def camera_clock(result: OrientedBlock) -> Drawing:
     """Draw the stills' stamps against the times of their exposures, offset and drift of the clock taken off."""
     name, title = "camera_clock", "Time stamps of the stills against their exposures"
     matches = result.block.exposures
-    if matches is None or not matches.clocks:
-        return Drawing(name=name, title=title, caption="", absent="No log tells the times of the exposures.")
+    if matches is None or not matches.clocks or all(still.event_gps_time_ns is None for still in matches.stills):
+        return Drawing(name=name, title=title, caption="", absent="Nothing settles the camera's clock.")
     figure = new_figure(2.7)
     axes = figure.add_subplot()
     plain_axes(axes, "Time since the first exposure [min]", "Stamp minus exposure [s]")
@@ -33,15 +33,21 @@ def camera_clock(result: OrientedBlock) -> Drawing:
 
 def _residuals(result: OrientedBlock, matches: ExposureMatches, clock: CameraClock) -> Array:
     """Return time since the first exposure and the residual of the stamp's middle, both in s, (k, 2)."""
-    first_ns = min(entry.gps_time_ns for entry in matches.stills if entry.gps_time_ns is not None)
+    known = [entry.event_gps_time_ns for entry in matches.stills if entry.event_gps_time_ns is not None]
+    first_ns = min(known, default=0)
     stills = {still.name: still for still in result.block.stills}
     wanted, rows = set(clock.stills), []
     for entry in matches.stills:
         still = stills.get(entry.still)
-        if entry.still not in wanted or entry.gps_time_ns is None or still is None or still.camera_time_ns is None:
+        if (
+            entry.still not in wanted
+            or entry.event_gps_time_ns is None
+            or still is None
+            or still.camera_time_ns is None
+        ):
             continue
-        since_s = (entry.gps_time_ns - clock.reference_gps_ns) * 1e-9
+        since_s = (entry.event_gps_time_ns - clock.reference_gps_ns) * 1e-9
         shown_s = (still.camera_time_ns - clock.reference_gps_ns) * 1e-9 + 0.5e-9 * still.camera_time_resolution_ns
-        since_first_s = (entry.gps_time_ns - first_ns) * 1e-9
+        since_first_s = (entry.event_gps_time_ns - first_ns) * 1e-9
         rows.append((since_first_s, shown_s - since_s * (1.0 + clock.drift_ppm * 1e-6) - clock.offset_s))
     return np.array(rows, dtype=np.float64).reshape(-1, 2)

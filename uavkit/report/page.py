@@ -254,7 +254,7 @@ def _exposure_section(result: OrientedBlock, pictures: dict[str, str]) -> str:
     return section(
         "Stills and exposures",
         f"<p>{escape(exposure_tables.summary_sentence(matches))}</p>",
-        table_html(clocks) if clocks.rows else "<p>The camera's clock could not be told.</p>",
+        table_html(clocks) if clocks.rows else "<p>Nothing settles the camera's clock.</p>",
         pictures["camera_clock"],
         table_html(unused) if unused.rows else "<p>Each exposure has its still.</p>",
         table_html(exposure_tables.exposures_table(matches)),

@@ -33,6 +33,8 @@ from uavkit.report.relative import relative_precision
 
 PUBLISHED_STILLS = 33
 WITHIN_THE_BLOCK = "after the block is fitted to the GNSS positions by shift, rotation and scale"
+UNDETERMINED = 0.9
+"""An unknown whose sigma stays above this share of the one before is not determined."""
 COLLAPSE_ABOVE = 40
 """Tables with more rows than this are folded."""
 
@@ -318,10 +320,25 @@ def gnss_shift_table(result: OrientedBlock) -> Table:
     note = "" if gnss is None or len(names) else "No position takes part in the adjustment."
     if len(adjusted.gnss_latency_s):
         header += ("Shutter latency [ms]",)
-        latencies = zip(-1e3 * adjusted.gnss_latency_s, 1e3 * adjusted.gnss_latency_sigma_s, strict=True)
-        rows = [(*row, f"{_signed(a, 1)} ± {number(b, 1)}") for row, (a, b) in zip(rows, latencies, strict=True)]
-        note += " Shutter latency: how much later than stated the exposures were; ingest takes it as --shutter-latency."
+        rows = [(*row, text) for row, text in zip(rows, _latencies(result), strict=True)]
+        note += (
+            " Shutter latency: of the exposure after its event, as stated and found together, which --shutter-latency takes."
+        )
     return Table(title="GNSS positions by flight", header=header, rows=tuple(rows), note=note.strip())
+
+
+def _latencies(result: OrientedBlock) -> list[str]:
+    """Return the shutter's latency of each flight, what was stated included; said not to be known where it is not."""
+    adjusted, gnss, matches = result.adjustment, result.block.gnss, result.block.exposures
+    stated_s = matches.shutter_latency_s if matches is not None else 0.0
+    prior_s = gnss.latency_sigma_s if gnss is not None else None
+    texts = []
+    for found_s, sigma_s in zip(adjusted.gnss_latency_s, adjusted.gnss_latency_sigma_s, strict=True):
+        if prior_s is not None and sigma_s > UNDETERMINED * prior_s:
+            texts.append("not determined")
+        else:
+            texts.append(f"{_signed(1e3 * (stated_s - found_s), 1)} ± {number(1e3 * sigma_s, 1)}")
+    return texts
 
 
 def _flight_of_fix(result: OrientedBlock) -> Array:
