@@ -158,16 +158,49 @@ def _windows(chain: Chain, limits: ClockLimits) -> list[tuple[float, float]]:
         if low > high:
             return []
     count = int((high - low) / width) + 2
-    best = np.zeros(count, dtype=np.int64)
     half_span = max(0.5 * float(chain.event_s[-1] - chain.event_s[0]), 1.0)
-    for drift in _drifts(min(half_span, 2.0 * _half_span(chain)), width, limits):
-        cells = np.zeros(count, dtype=np.int64)
-        count_differences(chain.still_s, chain.event_s + drift * (chain.event_s - middle), low, width, cells)
-        best = np.maximum(best, cells + np.maximum(np.append(cells[1:], 0), np.insert(cells[:-1], 0, 0)))
+    drifts = _drifts(min(half_span, 2.0 * _half_span(chain)), width, limits)
+    if count > MOST_CELLS:
+        number, best = _scattered_counts(chain, (low, high, width), drifts)
+    else:
+        number, best = np.arange(count), np.zeros(count, dtype=np.int64)
+        for drift in drifts:
+            cells = np.zeros(count, dtype=np.int64)
+            count_differences(chain.still_s, chain.event_s + drift * (chain.event_s - middle), low, width, cells)
+            best = np.maximum(best, cells + np.maximum(np.append(cells[1:], 0), np.insert(cells[:-1], 0, 0)))
+    if not len(best):
+        return []
     order = np.argsort(-best, kind="stable")[:MOST_WINDOWS]
     least = best[order[0]] - max(FEWER_AT_LEAST, FEWER_SHARE * float(best[order[0]]))
     chosen = order[best[order] >= max(least, 1.0)]
-    return [(low + width * float(k), low + width * float(k + 1)) for k in chosen]
+    return [(low + width * float(k), low + width * float(k + 1)) for k in number[chosen]]
+
+
+def _scattered_counts(chain: Chain, cell: tuple[float, float, float], drifts: Array) -> tuple[Indices, Indices]:
+    """Return the numbers of the cells that differences lie in, ascending, and the best count of each with a neighbour.
+
+    What lies years apart, as the one event with a damaged time does, would need more cells than the memory holds.
+    """
+    low, high, width = cell
+    middle = _middle(chain)
+    numbers, sums = list[Indices](), list[Indices]()
+    for drift in drifts:
+        moved = chain.event_s + drift * (chain.event_s - middle)
+        apart = (chain.still_s[:, None] - moved).ravel()
+        inside = apart[(apart >= low) & (apart <= high)]
+        number, count = np.unique(np.floor((inside - low) / width).astype(np.int64), return_counts=True)
+        after, before = (_count_at(number + step, number, count) for step in (1, -1))
+        numbers.append(number)
+        sums.append(count + np.maximum(after, before))
+    every, place = np.unique(np.concatenate(numbers), return_inverse=True)
+    best = np.zeros(len(every), dtype=np.int64)
+    np.maximum.at(best, place, np.concatenate(sums))
+    return every, best
+
+
+def _count_at(wanted: Indices, number: Indices, count: Indices) -> Indices:
+    place = np.minimum(np.searchsorted(number, wanted), max(len(number) - 1, 0))
+    return np.where(number[place] == wanted, count[place], 0) if len(number) else np.zeros(len(wanted), dtype=np.int64)
 
 
 def _peaks(
