@@ -1,5 +1,7 @@
 """Odd logs and decisions by hand: logs of like names are told apart, and what cannot be meant is refused."""
 
+import time
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +23,7 @@ from uavkit.core.progress import silent
 from uavkit.core.records import StillInfo
 from uavkit.formats.flight_logs import open_log
 from uavkit.formats.match_file import MatchRow
+from uavkit.ingest import exposure_clocks
 from uavkit.ingest.log_positions import LogOptions, positions_of_events, prepare_flights
 from uavkit.ingest.logged_stills import GivenMatches, short_names, stills_in_logs
 
@@ -86,6 +89,39 @@ def test_a_log_of_another_day_is_matched_by_its_intervals_but_called_doubtful(da
     told = [note for note in result.notes if "another flight of the same pattern" in note]
     assert len(told) == doubtful
     assert not doubtful or f"are {abs(days):.0f} days from" in told[0]
+
+
+@pytest.mark.parametrize("years", [-40, 100])
+def test_an_exposure_with_a_damaged_time_takes_neither_time_nor_memory(years: int) -> None:
+    """The differences of times then span decades: cells of 2 s over these would fill gigabytes."""
+    log = open_log(RECORDED / "sitl_distance_trigger/flight.BIN")
+    stills = stills_of(log, 31)
+    table = log.exposure_table
+    gps_ns = table.when.gps_ns.copy()
+    gps_ns[10] += years * 365 * 86_400 * 10**9
+    damaged = replace(table, when=replace(table.when, gps_ns=gps_ns))
+    tracemalloc.start()
+    begin = time.process_time()
+    result = stills_in_logs(stills, [replace(log, exposure_table=damaged)], GivenMatches(), LogOptions(), silent)
+    assert time.process_time() - begin < 10.0
+    assert tracemalloc.get_traced_memory()[1] < 200_000_000
+    tracemalloc.stop()
+    assert result.matches is not None
+    used = [entry for entry in result.matches.stills if entry.gps_time_ns is not None]
+    by_name = {still.name: int(table.when.gps_ns[row]) for row, still in enumerate(stills)}
+    assert all(abs(entry.gps_time_ns - by_name[entry.still]) < 10**9 for entry in used if entry.gps_time_ns)
+
+
+def test_offsets_counted_in_scattered_cells_give_the_same_matches(monkeypatch: pytest.MonkeyPatch) -> None:
+    log = open_log(RECORDED / "sitl_distance_trigger/flight.BIN")
+    stills = stills_of(log, 31)[3:]
+    dense = stills_in_logs(stills, [log], GivenMatches(), LogOptions(), silent)
+    monkeypatch.setattr(exposure_clocks, "MOST_CELLS", 0)
+    scattered = stills_in_logs(stills, [log], GivenMatches(), LogOptions(), silent)
+    assert dense.matches is not None
+    assert scattered.matches is not None
+    assert [entry.event for entry in scattered.matches.stills] == [entry.event for entry in dense.matches.stills]
+    assert sum(entry.event is not None for entry in dense.matches.stills) > 25
 
 
 def test_what_is_given_by_hand_needs_exposures_to_be_given() -> None:

@@ -21,6 +21,8 @@ MOST_IMPROVED = (80, 60, 45, 30)
 FEWER_SHARE = 0.25
 """Windows that hold so many fewer pairs than the best are not looked at."""
 FEWER_AT_LEAST = 10.0
+MOST_CELLS = 10_000_000
+"""Of the coarse windows: a range of offsets of some months."""
 MOST_SHIFT = 6
 MOST_ROUNDS = 4
 MOST_DRIFTS = 41
