@@ -348,6 +348,17 @@ def test_sums_too_small_to_be_told_are_no_sums():
     assert int(is_wrong(case, result.event, matched).sum()) <= 1
 
 
+def test_a_right_shift_that_no_vote_names_is_found():
+    """A hover of 903 stills at intervals even to 5 ms: the votes began some twenty stations beside the truth."""
+    rng = np.random.default_rng([30007, 19, 1, 10])
+    law = draw_law(rng, hover=True, resolution_s=0.01)
+    case = draw_case(rng, law, int(np.exp(rng.uniform(np.log(30), np.log(1000)))))
+    result = match_exposures(*stamps_of(case))
+    matched = np.array([state is StillState.MATCHED for state in result.state])
+    assert matched.sum() > 700
+    assert not is_wrong(case, result.event, matched).any()
+
+
 def test_a_nearly_constant_hover_is_not_settled_by_chance():
     """Intervals constant to 6 ms, noise of 24 ms: chance makes a wrong shift some thousand times likelier."""
     rng = np.random.default_rng([20017, 12, 1, 10])

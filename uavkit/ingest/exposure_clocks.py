@@ -23,8 +23,10 @@ FEWER_SHARE = 0.25
 FEWER_AT_LEAST = 10.0
 MOST_CELLS = 10_000_000
 """Of the coarse windows: a range of offsets of some months."""
-MOST_SHIFT = 6
-MOST_ROUNDS = 4
+SHIFTS = (1, 2, 3, 4, 6, 9, 14, 21, 32)
+"""A better shift is looked for so many events further on and back: in a regular flight the right one may be far."""
+MOST_NEIGHBOURS = 6
+MOST_ROUNDS = 12
 MOST_DRIFTS = 41
 NEAR_BEST = 20.0
 """Settings whose logarithm is so much lower than the best do not count."""
@@ -73,14 +75,15 @@ def _neighbours(chain: Chain, clock: Clock, limits: ClockLimits) -> list[Weighed
 
     In a regular flight these are nearly as good, and the votes may have named only some of them.
     """
-    found = []
-    noise = 2.5 * chain.noise_s + _vote_step(chain)
-    for k in range(1, min(MOST_SHIFT, len(chain.event_s) - 1) + 1):
+    rough = []
+    noise, blur = 2.5 * chain.noise_s + _vote_step(chain), 0.5 * _vote_step(chain)
+    for k in (shift for shift in SHIFTS if shift < len(chain.event_s)):
         shift_s = float(np.median(chain.event_s[k:] - chain.event_s[:-k]))
         for sign in (-1.0, 1.0):
             moved = _fitted_to_nearest(chain, clock.moved(sign * shift_s, 0.0), noise, limits)
-            found.append(_improved(chain, _improved(chain, moved, 0.5 * _vote_step(chain), limits).clock, 0.0, limits))
-    return found
+            rough.append(WeighedClock(clock=moved, log_sum=log_sum(chain, moved, blur)))
+    likely = sorted(rough, key=lambda entry: -entry.log_sum)[:MOST_NEIGHBOURS]
+    return [_improved(chain, _improved(chain, entry.clock, blur, limits).clock, 0.0, limits) for entry in likely]
 
 
 def _nearly_best(found: list[WeighedClock], margin: float, most: int) -> list[WeighedClock]:
