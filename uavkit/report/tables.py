@@ -321,9 +321,7 @@ def gnss_shift_table(result: OrientedBlock) -> Table:
     if len(adjusted.gnss_latency_s):
         header += ("Shutter latency [ms]",)
         rows = [(*row, text) for row, text in zip(rows, _latencies(result), strict=True)]
-        note += (
-            " Shutter latency: of the exposure after its event, as stated and found together, which --shutter-latency takes."
-        )
+        note += " Shutter latency: exposure after event, stated and found together; --shutter-latency takes it."
     return Table(title="GNSS positions by flight", header=header, rows=tuple(rows), note=note.strip())
 
 
