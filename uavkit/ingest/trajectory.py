@@ -256,7 +256,7 @@ def build_trajectory(table: FixTable, options: TrajectoryOptions = TrajectoryOpt
     frame = LocalFrame.at(float(place[0][middle]), float(place[1][middle]), float(height_m[middle]))
     position_m = frame.enu_from_geographic(*place, height_m)
     sigma_m = np.column_stack([table.sigma_horizontal_m[good], table.sigma_vertical_m[good]])
-    sigma_m[~(sigma_m > 0.0)] = np.nan
+    sigma_m[~((sigma_m > 0.0) & np.isfinite(sigma_m))] = np.nan
     return _trajectory(
         (frame, datum, options),
         (table.when.gps_ns[good], lost_ns),
