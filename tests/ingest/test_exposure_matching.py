@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from exposure_cases import Case, by_index, by_nearest_time, draw_case, draw_law
 
+from uavkit.core.exposures import StillState
 from uavkit.core.gpstime import NO_TIME
-from uavkit.ingest.exposure_matching import EventState, MatchOptions, StillState, match_exposures, offset_in_words
+from uavkit.ingest.exposure_matching import EventState, MatchOptions, match_exposures, offset_in_words
 from uavkit.ingest.exposure_stamps import ExposureStamps, StillStamps
 
 CASES = 50

@@ -8,7 +8,8 @@ from exposure_cases import draw_case, draw_law
 from exposure_oracle import SETTLED, probability_of_true_shift
 from test_exposure_matching import is_wrong, stamps_of
 
-from uavkit.ingest.exposure_matching import StillState, match_exposures
+from uavkit.core.exposures import StillState
+from uavkit.ingest.exposure_matching import match_exposures
 
 
 @dataclass

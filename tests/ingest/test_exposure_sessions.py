@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from test_exposure_matching import GPS0_NS, exposure_stamps, flight, still_stamps
 
+from uavkit.core.exposures import StillState
 from uavkit.core.gpstime import NO_TIME
-from uavkit.ingest.exposure_matching import StillState, match_exposures
+from uavkit.ingest.exposure_matching import match_exposures
 from uavkit.ingest.exposure_stamps import (
     ExposureStamps,
     StillStamps,

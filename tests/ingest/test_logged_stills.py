@@ -208,7 +208,9 @@ def test_what_the_user_gives_counts_and_is_checked(logs: dict[str, FlightLog], t
     result = found(stills, [log])
     path = tmp_path / "exposures.csv"
     assert result.matches is not None
-    write_matches(path, rows_of_matches(result.matches))
+    write_matches(path, rows_of_matches(result.matches), ["not used flight.BIN 40 - no still: is near"])
+    assert len(read_matches(path)) == len(stills)
+    assert path.read_text(encoding="utf-8").endswith("# not used flight.BIN 40 - no still: is near\n")
     assert events(found(stills, [log], read_matches(path))) == events(result)  # as written, it changes nothing
     given = MatchRow(image="DSC00007.JPG", event="none")
     changed = found(stills, [log], [given])

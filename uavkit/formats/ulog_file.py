@@ -31,7 +31,6 @@ from uavkit.formats.kernels import ulog_frames as kernels
 from uavkit.formats.log_bytes import Blocks, DamageTally, opened
 
 MAGIC = bytes((0x55, 0x4C, 0x6F, 0x67, 0x01, 0x12, 0x35))
-HEADER_BYTES = 16
 BLOCK_BYTES = 1024 * 1024
 MOST_TEXTS = 10_000
 _MOST_LISTED = 1 << 17

@@ -16,6 +16,7 @@ from enum import Enum
 import numpy as np
 
 from uavkit.core.arrays import Array, Indices
+from uavkit.core.exposures import StillState
 from uavkit.core.gpstime import NO_TIME
 from uavkit.core.progress import Progress, silent
 from uavkit.ingest.exposure_chain import Chain, build_chain
@@ -34,17 +35,6 @@ LEAST_PAUSE_S = 60.0
 PAUSE_INTERVALS = 10.0
 """A pause so long is one between sorties: the camera's clock may have been set anew."""
 MOST_RUNS = 16
-
-
-class StillState(Enum):
-    """What is known of a still."""
-
-    MATCHED = "matched"
-    DOUBLED = "doubled"
-    """Its exposure is told by several events, and which of them is its own cannot be told: one of them is given."""
-    AMBIGUOUS = "ambiguous"
-    NO_EVENT = "no event"
-    NO_TIME = "no time"
 
 
 class EventState(Enum):

@@ -200,7 +200,7 @@ def _still(
     row: int, info: StillInfo, known: tuple[MergedExposures, ExposureMatching], place: EventPosition | None
 ) -> StillExposure:
     merged, found = known
-    state, event = StillState(found.state[row].value), int(found.event[row])
+    state, event = found.state[row], int(found.event[row])
     if found.reason[row] == BY_HAND:
         state = StillState.GIVEN
     named = event >= 0 and state is not StillState.NO_EVENT

@@ -1,4 +1,4 @@
-"""What the user decides by hand goes before what the matching found; and the matching as rows of a file to edit."""
+"""What the user decides by hand goes before what the matching found."""
 
 import re
 from collections.abc import Sequence
@@ -7,38 +7,16 @@ from dataclasses import replace
 import numpy as np
 
 from uavkit.core.errors import InputError, did_you_mean
+from uavkit.core.exposures import StillState
 from uavkit.core.gpstime import NO_TIME
 from uavkit.formats.match_file import NONE, MatchRow
-from uavkit.ingest.exposure_matching import EventState, ExposureMatching, StillState
+from uavkit.ingest.exposure_matching import EventState, ExposureMatching
 from uavkit.ingest.exposure_stamps import ExposureStamps
 
 NEAR_S = 0.05
 """A GPS time means the event so near to it."""
 _LAST_S = 2**63 // 10**9 - 1
 """What comes later has no place in 64 bits of nanoseconds."""
-
-
-def match_rows(matching: ExposureMatching, names: Sequence[str], events: ExposureStamps) -> tuple[MatchRow, ...]:
-    """Return the matching of n named stills as rows; what is ambiguous is left open, with the reason beside it."""
-    rows = []
-    for row, name in enumerate(names):
-        state, event = matching.state[row], int(matching.event[row])
-        used = state in (StillState.MATCHED, StillState.DOUBLED)
-        rows.append(
-            MatchRow(
-                image=name,
-                event=events.label[event] if used else (NONE if state is StillState.NO_EVENT else ""),
-                gps_time=_seconds(int(events.gps_ns[event])) if used else "",
-                state=state.value,
-                probability=f"{matching.probability[row]:.5f}",
-                reason=matching.reason[row],
-            )
-        )
-    return tuple(rows)
-
-
-def _seconds(gps_ns: int) -> str:
-    return f"{gps_ns // 10**9}.{gps_ns % 10**9:09d}"
 
 
 def apply_overrides(

@@ -23,7 +23,6 @@ LAST_US, SYNCHRONISED, END = 0, 1, 2
 """Places in a scan's state: time of the last message (-1: none), whether it ended here, where the last one ended."""
 
 _FMT = 0x80
-_FMT_LENGTH = 89
 
 
 @kernel
