@@ -12,9 +12,9 @@ from uavkit.core.gpstime import NO_TIME
 from uavkit.ingest.exposure_matching import EventState, MatchOptions, match_exposures, offset_in_words
 from uavkit.ingest.exposure_stamps import ExposureStamps, StillStamps
 
-CASES = 50
-"""Of each of four kinds in the ordinary run."""
-MOST = 300
+CASES = 60
+"""Of each of three kinds in the ordinary run; of hover flights with whole seconds, which cost most, a third."""
+MOST = 150
 """Exposures of a flight in the ordinary run; 1000 in the slow one."""
 GPS0_NS = 1_400_000_000 * 10**9
 NOISE_WIDTHS = 5.0
@@ -137,10 +137,10 @@ def test_no_wrong_pair_with_stamps_of_10_ms(hover):
 
 @pytest.mark.parametrize("hover", [False, True], ids=["distance", "hover"])
 def test_hardly_a_wrong_pair_with_stamps_of_1_s(hover):
-    tally = run(CASES, hover=hover, resolution_s=1.0, most=MOST)
+    tally = run(CASES // 3 if hover else CASES, hover=hover, resolution_s=1.0, most=500 if hover else MOST)
     print(tally.line(f"1 s, {'hover' if hover else 'distance'}"))  # noqa: T201 - shown with -s
     assert tally.wrong <= max(0.001 * tally.given, 3.0), tally.wrong_cases
-    assert tally.settled_cases >= (3 if hover else CASES - 4)
+    assert tally.settled_cases >= (2 if hover else CASES - 4)
     # some pairs no one can tell (two stills within the second of one event): against what can be known at all, see
     # the comparison with the exhaustive search
     assert tally.found + tally.found_doubled >= 0.95 * tally.settled_pairs

@@ -61,8 +61,17 @@ def test_times_and_tone_place_what_detail_cannot(monkeypatch, ground):
     assert np.abs(off).max() < 3.0 * 2.4  # within the search of tracking, 3 video pixels
 
 
-@pytest.mark.parametrize("ground", [crop, bare_crop])
-@pytest.mark.parametrize("lost", [0, 3, 6])
+@pytest.mark.parametrize(
+    ("ground", "lost"),
+    [
+        (crop, 0),
+        (bare_crop, 3),
+        (crop, 6),
+        pytest.param(bare_crop, 0, marks=pytest.mark.slow),
+        pytest.param(crop, 3, marks=pytest.mark.slow),
+        pytest.param(bare_crop, 6, marks=pytest.mark.slow),
+    ],
+)
 def test_a_lost_event_among_look_alikes_shifts_no_other_place(monkeypatch, ground, lost):
     monkeypatch.setattr(synthetic, "texture", ground)
     _, places = places_of(make_flight(seed=5).without_still(lost))
