@@ -1,6 +1,5 @@
 """The command line: a command for each stage. It draws progress, words results, and turns errors into one line."""
 
-import math
 import os
 import sys
 import time
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from uavkit.core.result import OrientedBlock
     from uavkit.project import Project
 
-LONGEST_LEVER_ARM_M = 100.0
 EXIT_ERROR = 2
 EXIT_DEFECT = 1
 EXIT_INTERRUPTED = 130
@@ -266,11 +264,13 @@ def ingest(
 
 
 def _lever_arm(text: str) -> tuple[float, float, float]:
+    from uavkit.ingest.log_positions import LONGEST_ARM_M
+
     try:
         forward, right, down = (float(part) for part in text.split(","))
     except ValueError:
         raise typer.BadParameter(f"--lever-arm {text!r}: give forward,right,down in metres, like 0.2,0,-0.3") from None
-    if not math.hypot(forward, right, down) <= LONGEST_LEVER_ARM_M:
+    if not all(abs(length) <= LONGEST_ARM_M for length in (forward, right, down)):
         raise typer.BadParameter(f"--lever-arm {text!r}: no antenna is that far from its camera: give metres")
     return forward, right, down
 

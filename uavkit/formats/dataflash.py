@@ -50,7 +50,7 @@ from uavkit.formats.dataflash_fields import (
 )
 from uavkit.formats.dataflash_tables import flight_log
 from uavkit.formats.kernels import dataflash_frames as frames
-from uavkit.formats.log_bytes import Blocks, DamageTally, opened
+from uavkit.formats.log_bytes import DamageTally, feed, opened
 
 _REASONS = {
     frames.NO_HEADER: "no message begins here",
@@ -104,10 +104,7 @@ def _read(path: Path, names: frozenset[str], progress: Progress, block_bytes: in
 
 
 def _scanned(stream: BinaryIO, scan: "_Scan", progress: Progress, size: int, block_bytes: int) -> "_Scan":
-    blocks, consumed = Blocks(stream, block_bytes), 0
-    while (block := blocks.next(consumed)) is not None:
-        consumed = scan.take(block, blocks.offset, blocks.final)
-        progress("reading the log", blocks.offset + consumed, max(size, blocks.offset + consumed))
+    feed(stream, scan.take, progress, size, block_bytes)
     return scan
 
 

@@ -34,7 +34,7 @@ from uavkit.formats.dataflash_fields import (
 )
 from uavkit.formats.dataflash_tables import flight_log
 from uavkit.formats.kernels import dataflash_lines as marks
-from uavkit.formats.log_bytes import Blocks, DamageTally, opened
+from uavkit.formats.log_bytes import DamageTally, feed, opened
 
 _BLOCK_BYTES = 1024 * 1024
 _LONGEST_LINE = 8192
@@ -80,10 +80,7 @@ def read_messages(
 
 
 def _read(stream: BinaryIO, lines: "_Lines", progress: Progress, size: int, block_bytes: int) -> "_Lines":
-    blocks, consumed = Blocks(stream, block_bytes), 0
-    while (block := blocks.next(consumed)) is not None:
-        consumed = lines.take(block, blocks.offset, blocks.final)
-        progress("reading the log", blocks.offset + consumed, max(size, blocks.offset + consumed))
+    feed(stream, lines.take, progress, size, block_bytes)
     return lines
 
 

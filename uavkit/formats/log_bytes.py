@@ -1,7 +1,7 @@
 """Logs as streams of bytes: read in blocks with bounded memory, what is lost counted span by span."""
 
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from uavkit.core.errors import InputError
 from uavkit.core.flight_log import Damage, LostBytes
+from uavkit.core.progress import Progress
 
 BLOCK_BYTES = 8 * 1024 * 1024
 MOST_SPANS = 200
@@ -47,6 +48,20 @@ class Blocks:
         self.final = len(more) < self._size
         self._block = np.concatenate([left, np.frombuffer(more, dtype=np.uint8)])
         return self._block if len(self._block) else None
+
+
+def feed(
+    stream: BinaryIO,
+    take: Callable[[NDArray[np.uint8], int, bool], int],
+    progress: Progress,
+    size: int,
+    block_bytes: int,
+) -> None:
+    """Hand a stream block by block to ``take(block, offset, final)``, which returns how much of it is done with."""
+    blocks, consumed = Blocks(stream, block_bytes), 0
+    while (block := blocks.next(consumed)) is not None:
+        consumed = take(block, blocks.offset, blocks.final)
+        progress("reading the log", blocks.offset + consumed, max(size, blocks.offset + consumed))
 
 
 class DamageTally:

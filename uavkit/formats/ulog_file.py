@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from uavkit.core.flight_log import Damage
 from uavkit.core.progress import Progress
 from uavkit.formats.kernels import ulog_frames as kernels
-from uavkit.formats.log_bytes import Blocks, DamageTally, opened
+from uavkit.formats.log_bytes import DamageTally, feed, opened
 
 MAGIC = bytes((0x55, 0x4C, 0x6F, 0x67, 0x01, 0x12, 0x35))
 BLOCK_BYTES = 1024 * 1024
@@ -87,11 +87,8 @@ def read_ulog(path: Path, wanted: Mapping[str, tuple[str, ...]], progress: Progr
     """
     size = max(path.stat().st_size, 1) if path.is_file() else 1
     with opened(path) as stream:
-        blocks, scanner = Blocks(stream, BLOCK_BYTES), _Scanner(wanted)
-        consumed = 0
-        while (block := blocks.next(consumed)) is not None:
-            consumed = scanner.scan(block, blocks.offset, blocks.final)
-            progress("read log", min(blocks.offset + consumed, size), size)
+        scanner = _Scanner(wanted)
+        feed(stream, scanner.scan, progress, size, BLOCK_BYTES)
     return scanner.result()
 
 

@@ -38,7 +38,7 @@ class LogOptions:
     """From the event to the exposure."""
 
     def __post_init__(self) -> None:
-        if not max(map(abs, self.lever_arm_m)) <= LONGEST_ARM_M:
+        if not all(abs(length) <= LONGEST_ARM_M for length in self.lever_arm_m):
             raise InputError(
                 f"a lever arm of {self.lever_arm_m}: forward, right, down in metres, at most {LONGEST_ARM_M:g}"
             )

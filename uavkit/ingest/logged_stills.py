@@ -25,12 +25,11 @@ from uavkit.ingest.log_positions import (
     prepare_flights,
     turned_by_attitude,
 )
-from uavkit.ingest.match_overrides import apply_overrides
+from uavkit.ingest.match_overrides import BY_HAND, apply_overrides
 from uavkit.ingest.positions import JoinedPositions, PositionOptions
 
 LEAST_SHOWN, SHARE_SHOWN = 5, 0.8
 """So many stills, and so much of all, must show their shutter in the video for its times to be used."""
-BY_HAND = "by hand"
 OTHER_DAY_S = 36 * 3600.0
 """Local time is at most 14 hours off, and a clock left on the wrong half of the day 12 more."""
 MOST_NAMED = 20

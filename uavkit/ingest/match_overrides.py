@@ -13,6 +13,8 @@ from uavkit.formats.match_file import NONE, MatchRow
 from uavkit.ingest.exposure_matching import EventState, ExposureMatching
 from uavkit.ingest.exposure_stamps import ExposureStamps
 
+BY_HAND = "by hand"
+"""The reason of a decision."""
 NEAR_S = 0.05
 """A GPS time means the event so near to it."""
 _LAST_S = 2**63 // 10**9 - 1
@@ -43,7 +45,7 @@ def apply_overrides(
             reason[other] = f"its event was given to {names[still]} by hand"
         event[still], probability[still], spread[still] = target, 1.0, 0.0
         state[still] = StillState.MATCHED if target >= 0 else StillState.NO_EVENT
-        reason[still] = "by hand"
+        reason[still] = BY_HAND
         if target >= 0:
             owner[target] = still
     event_state, event_reason = _events(matching, event, state)
