@@ -103,7 +103,8 @@ def test_each_still_has_its_exposure_and_lies_where_the_autopilot_says(logs: dic
     frame = LocalFrame.at(35.8, 139.65, 0.0)
     told_m = frame.enu_from_geographic(table.latitude_deg, table.longitude_deg, np.zeros(len(table)))[:, :2]
     apart_m = np.linalg.norm(places_m(result)[:, :2] - told_m, axis=1)
-    assert np.nanmedian(apart_m) < 0.35  # the receiver's noise beside the autopilot's own estimate
+    # without the receiver's delay it would be 0.23, 0.13 and 0.49 m; PX4's simulated receiver is the noisiest
+    assert np.nanmedian(apart_m) < (0.35 if flight == "px4" else 0.06)
     assert result.matches is not None
     (clock,) = result.matches.clocks
     assert clock.offset_s == pytest.approx(LOCAL_TIME_S, abs=0.1)
